@@ -1,0 +1,259 @@
+"""The commands for people: ls, show, why, verify, gc, pin. Each is a function that a command line mounts."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import nearest
+from pipeline.errors import UserError
+from pipeline.hydra_config import compose
+from pipeline.progress import duration
+from pipeline.runner import make_plan, split_config
+from pipeline.store import Artifact, HashCache, Store, iter_inputs
+
+
+def size(count: float) -> str:
+    """1.2 MB, and so on."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} TB"
+
+
+def _flat(value: Any, path: str = "") -> dict[str, Any]:
+    if isinstance(value, Mapping) and value:
+        return {
+            name: leaf for key, item in value.items() for name, leaf in _flat(item, f"{path}.{key}" if path else key).items()
+        }
+    return {path: value}
+
+
+def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Lines naming what differs between two preimages: ``render.max_spp: 64 -> 256``."""
+    before, after = _flat(old), _flat(new)
+    lines = []
+    for name in sorted(before.keys() | after.keys()):
+        if before.get(name, "absent") != after.get(name, "absent"):
+            shown = name.replace("params.", f"{new['stage']}.", 1)
+            a, b = (_short(side.get(name, "absent")) for side in (before, after))
+            lines.append(f"{shown}: {a} -> {b}")
+    return lines
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text[:12] if len(text) == 64 and all(c in "0123456789abcdef" for c in text) else text
+
+
+def command_ls(store: Store, arguments: argparse.Namespace) -> int:
+    artifacts = store.artifacts(arguments.stage)
+    for artifact in artifacts:
+        outputs = artifact.manifest["outputs"]
+        age = duration(time.time() - artifact.manifest["finished"])
+        pin = "pinned" if store.pinned(artifact.key) else ""
+        rejects = sum(outputs["rejects"].values())
+        name = f"{artifact.stage}/{artifact.path.name}"
+        print(f"{name:<44} {outputs['records']:>7} records {rejects:>5} rejected {size(outputs['bytes']):>8}  {age} ago  {pin}")
+    for path in store.drafts():
+        if arguments.stage in (None, path.parent.name):
+            holder = store.claim(path.parent.name, path.name.removesuffix(".partial")).holder()
+            state = f"in the making by process {holder['pid']} on {holder['host']}" if holder else "unfinished"
+            print(f"{path.parent.name}/{path.name[:12]}.partial  {len(list((path / 'markers').glob('*.json')))} parts, {state}")
+    if not artifacts:
+        print(f"no artifacts in {store.root}")
+    return 0
+
+
+def command_show(store: Store, arguments: argparse.Namespace) -> int:
+    artifact = store.resolve(arguments.artifact)
+    manifest = artifact.manifest
+    outputs = manifest["outputs"]
+    print(f"{artifact.stage}/{artifact.path.name}")
+    print(f"  path      {artifact.path}")
+    print(f"  key       {artifact.key}{'  (pinned)' if store.pinned(artifact.key) else ''}")
+    print(f"  digest    {artifact.digest}")
+    print(
+        f"  records   {outputs['records']} of {outputs['items']} items in {len(outputs['parts'])} parts, {size(outputs['bytes'])}"
+    )
+    for reason, count in sorted(outputs["rejects"].items()):
+        print(f"  rejected  {count} {reason}")
+    for reject in artifact.rejects()[: arguments.rejects]:
+        print(f"            {reject['item']}: {reject['reason']}: {reject['detail']}")
+    seconds = manifest["finished"] - manifest["started"]
+    when = time.strftime("%Y-%m-%d %H:%M", time.localtime(manifest["finished"]))
+    code = manifest["code"]
+    print(
+        f"  made      {when} in {duration(seconds)} on {manifest['machine']['host']}, {manifest['machine']['gpu'] or 'no GPU'}"
+    )
+    print(f"  command   {manifest['command']}")
+    print(
+        f"  code      version {manifest['preimage']['version']}, commit {code['commit']}{' with changes' if code['dirty'] else ''}"
+    )
+    for name, value in sorted(_flat(manifest["environment"]).items()):
+        if name:
+            print(f"  runtime   {name} = {value}")
+    for name, value in sorted(_flat(manifest["preimage"]["params"]).items()):
+        if not name.startswith("identity.items"):
+            print(f"  config    {artifact.stage}.{name} = {_short(value)}")
+    for name, value in _flat(manifest["summary"]).items():
+        if name:
+            print(f"  summary   {name} = {value}")
+    for name, entry in outputs["files"].items():
+        print(f"  file      files/{name}  {size(entry['bytes'])}")
+    print("  lineage")
+    _lineage(store, artifact, "    ", set())
+    return 0
+
+
+def _lineage(store: Store, artifact: Artifact, indent: str, seen: set[str]) -> None:
+    for name, key, parent in iter_inputs(store, artifact):
+        again = " (above)" if key in seen and parent is not None else ""
+        print(f"{indent}{name}/{parent.path.name if parent else key[:12] + ' (gone)'}{again}")
+        if parent is not None and not again:
+            seen.add(key)
+            _lineage(store, parent, indent + "  ", seen)
+
+
+def command_why(store: Store, arguments: argparse.Namespace) -> int:
+    """Two artifacts: what differs. A stage and overrides: why it would be computed, against the nearest artifact."""
+    first, *rest = arguments.words
+    if len(rest) == 1 and "=" not in rest[0]:
+        old, new = store.resolve(first), store.resolve(rest[0])
+        if old.stage != new.stage:
+            raise UserError(f"{first} is of stage {old.stage}, {rest[0]} of {new.stage}: only like can be compared")
+        _explain(store, old.manifest["preimage"], new.manifest["preimage"], "", lambda key: _preimage(store, key))
+        return 0
+    run, system, sections = split_config(compose([f"stage={first}", *rest]))
+    plan = make_plan(run, system, sections, HashCache(store.root / ".cache" / "hashes.json"))
+    by_key = {planned.key: planned.preimage for planned in plan.values()}
+    for name, planned in plan.items():
+        artifact = store.find(name, planned.key)
+        if artifact is not None:
+            print(f"{name}: up to date, {artifact.stage}/{artifact.path.name}")
+            continue
+        others = store.artifacts(name)
+        if not others:
+            print(f"{name}: to make, there is no {name} artifact in {store.root}")
+            continue
+        # the nearest: fewest differing leaves, the newest among equals
+        near = min(reversed(others), key=lambda a: len(difference(a.manifest["preimage"], planned.preimage)))
+        print(f"{name}: to make; against {name}/{near.path.name}:")
+        _explain(
+            store,
+            near.manifest["preimage"],
+            planned.preimage,
+            "  ",
+            lambda key: by_key.get(key) or _preimage(store, key),
+        )
+    return 0
+
+
+def _preimage(store: Store, key: str) -> Mapping[str, Any] | None:
+    found = [artifact for artifact in store.artifacts() if artifact.key == key]
+    return found[0].manifest["preimage"] if found else None
+
+
+def _explain(
+    store: Store,
+    old: Mapping[str, Any],
+    new: Mapping[str, Any],
+    indent: str,
+    preimage: Callable[[str], Mapping[str, Any] | None],
+) -> None:
+    lines = difference(old, new)
+    own = [line for line in lines if not line.startswith("inputs.")]
+    for line in own:
+        print(f"{indent}{line}")
+    for name in sorted(old["inputs"].keys() | new["inputs"].keys()):
+        a, b = old["inputs"].get(name), new["inputs"].get(name)
+        if a != b and a and b:
+            before, after = preimage(a), preimage(b)
+            print(f"{indent}input {name}: {a[:12]} -> {b[:12]}")
+            if before is not None and after is not None:
+                _explain(store, before, after, indent + "  ", preimage)
+    if not lines:
+        print(f"{indent}nothing differs")
+
+
+def command_verify(store: Store, arguments: argparse.Namespace) -> int:
+    artifacts = [store.resolve(name) for name in arguments.artifacts] or store.artifacts()
+    bad = 0
+    for artifact in artifacts:
+        problems = artifact.verify(deep=arguments.deep)
+        bad += bool(problems)
+        print(f"{artifact.stage}/{artifact.path.name}: {'sound' if not problems else f'{len(problems)} problem(s)'}")
+        for problem in problems:
+            print(f"  {problem}")
+    how = "every byte read" if arguments.deep else "sizes and listings; --deep reads every byte"
+    print(f"{len(artifacts) - bad} of {len(artifacts)} artifacts sound ({how})")
+    return 1 if bad else 0
+
+
+def command_gc(store: Store, arguments: argparse.Namespace) -> int:
+    found = store.garbage(arguments.days)
+    total = 0
+    for path, reason in found:
+        count = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+        total += count
+        print(f"{'deleting' if arguments.delete else 'would delete'} {path.relative_to(store.root)}  {size(count)}  {reason}")
+        if arguments.delete:
+            aside = path.with_name(f".gone-{path.name}")
+            path.rename(aside)  # out of sight at once: a kill in the middle leaves no half artifact
+            shutil.rmtree(aside)
+    verb = "freed" if arguments.delete else "to free; nothing was deleted, add --delete"
+    print(f"{len(found)} entries, {size(total)} {verb}")
+    return 0
+
+
+def command_pin(store: Store, arguments: argparse.Namespace) -> int:
+    artifact = store.resolve(arguments.artifact)
+    store.pin(artifact.key, not arguments.remove)
+    print(f"{artifact.stage}/{artifact.path.name} {'no longer pinned' if arguments.remove else 'pinned: gc keeps it'}")
+    return 0
+
+
+def add_commands(parsers: Any, program: str) -> None:
+    """Mount the engine's commands on ``parsers`` (argparse's subparsers)."""
+
+    def add(
+        name: str, function: Callable[[Store, argparse.Namespace], int], summary: str, example: str
+    ) -> argparse.ArgumentParser:
+        parser = parsers.add_parser(
+            name, help=summary, description=summary, epilog=f"example: {program} {name} {example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )  # fmt: skip
+        parser.add_argument("--store", default="store", help="the store's folder (default: store)")
+        parser.set_defaults(function=lambda arguments: function(_existing(arguments.store), arguments))
+        return parser
+
+    parser = add("ls", command_ls, "list artifacts and unfinished work", "render")
+    parser.add_argument("stage", nargs="?", help="only this stage")
+    parser = add("show", command_show, "show one artifact: config, counts, rejects, summary, lineage", "render")
+    parser.add_argument("artifact", help="a key or its beginning, stage/folder, or a stage's name for its newest")
+    parser.add_argument("--rejects", type=int, default=10, help="how many rejects to list (default: 10)")
+    parser = add("why", command_why, "say which parameter makes a stage run again", "render render.spp=64")
+    parser.add_argument("words", nargs="+", help="a stage and config overrides, or two artifacts to compare")
+    parser = add("verify", command_verify, "check artifacts against their manifests", "--deep")
+    parser.add_argument("artifacts", nargs="*", help="which (default: all)")
+    parser.add_argument("--deep", action="store_true", help="read and hash every byte")
+    parser = add("gc", command_gc, "delete what is unpinned, unused and not an input of a kept artifact", "--days 14 --delete")
+    parser.add_argument("--days", type=float, default=14.0, help="keep what was used within so many days (default: 14)")
+    parser.add_argument("--delete", action="store_true", help="really delete; without it only the list is printed")
+    parser = add("pin", command_pin, "keep an artifact from gc", "train/tiny-0123456789ab")
+    parser.add_argument("artifact", help="as for show")
+    parser.add_argument("--remove", action="store_true", help="take the pin off")
+
+
+def _existing(path: str) -> Store:
+    if not Path(path).is_dir():
+        raise UserError(f"there is no store at {path}: give --store DIR, or make one with `make data`")
+    return Store(path)
+
+
+__all__ = ["add_commands", "difference", "nearest"]

@@ -1,0 +1,93 @@
+"""From Hydra's composed YAML to frozen, typed configs: one conversion, at the boundary.
+
+Every stage has a ``StageConfig`` right above the code that it configures. Unknown keys are errors that name the nearest
+right one; ``runtime`` fields (workers, devices, logging) stay out of keys.
+"""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from pipeline.errors import UserError
+
+
+def runtime(default: Any = ..., **kwargs: Any) -> Any:
+    """A field that changes how a stage runs, not what it makes; left out of the key."""
+    return Field(default, json_schema_extra={"runtime": True}, **kwargs)
+
+
+def added(default: Any, legacy: Any, **kwargs: Any) -> Any:
+    """A field that came later: left out of the key while it equals ``legacy``, the value that older artifacts imply."""
+    return Field(default, json_schema_extra={"legacy": legacy}, **kwargs)
+
+
+def count(default: Any = ..., **kwargs: Any) -> Any:
+    """A field that says only *how many* items there are: part of the artifact's key, not of an item's."""
+    return Field(default, json_schema_extra={"count": True}, **kwargs)
+
+
+class Section(BaseModel):
+    """Base of every config model: frozen, no unknown fields, no NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, protected_namespaces=())
+
+
+class Limits(Section):
+    """What one item may use before its worker is killed and the item rejected (after one retry alone)."""
+
+    cpu_s: float = 600.0  # CPU seconds
+    wall_s: float = 1800.0  # seconds on the clock, for what hangs without computing
+    memory_gb: float = 8.0  # resident memory of the worker
+
+
+class StageConfig(Section):
+    """Base of every stage's config."""
+
+    workers: int | None = runtime(None, ge=1)  # worker processes of this stage; None: the run's
+    limits: Limits = runtime(Limits())
+    max_reject_share: float = runtime(0.5, ge=0, le=1)  # above this share of rejected items the stage fails
+
+
+def nearest(word: str, known: Any) -> str:
+    """', did you mean X?' for the nearest known word, else the list of known ones."""
+    known = sorted(known)
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; known are {', '.join(known)}" if known else ""
+
+
+def _fields(kind: Any, data: Any) -> set[str]:
+    """Field names of the model class that ``data`` selects from ``kind`` (a model or an annotated union)."""
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return set(kind.model_fields)
+    names: set[str] = set()
+    for argument in getattr(kind, "__args__", ()):
+        if isinstance(argument, type) and issubclass(argument, BaseModel):
+            chosen = argument.model_fields.get("name")
+            if not isinstance(data, dict) or chosen is None or chosen.default == data.get("name"):
+                names |= set(argument.model_fields)
+        else:
+            names |= _fields(argument, data)
+    return names
+
+
+def parse(kind: Any, data: Any, where: str) -> Any:
+    """``data`` (plain containers) as a frozen ``kind``; a UserError names what is wrong and the nearest right key."""
+    try:
+        return TypeAdapter(kind).validate_python(data)
+    except ValidationError as error:
+        lines = []
+        for problem in error.errors():
+            location = [str(part) for part in problem["loc"]]
+            path = ".".join([where, *location])
+            if problem["type"] == "extra_forbidden":
+                lines.append(f"{path} is unknown{nearest(location[-1], _fields(kind, data))}")
+            elif problem["type"] == "missing":
+                lines.append(f"{path} is needed")
+            else:
+                lines.append(f"{path}={problem.get('input')!r}: {problem['msg']}")
+        raise UserError("; ".join(lines)) from None

@@ -1,0 +1,188 @@
+"""Running parts in local processes that may die: spawned workers, limits per item, one retry alone, then a reject.
+
+An item that brings its worker down (crash, CPU time, wall time or memory over the limit) is tried once more, first in a
+fresh process; if that dies too the item is rejected as ``crash``, ``time`` or ``memory``, marked as machine-dependent.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, wait
+from pathlib import Path
+from typing import Any
+
+import psutil
+from pebble import ProcessExpired, ProcessPool
+
+from pipeline.config import Limits
+from pipeline.errors import UserError
+from pipeline.worker import (
+    THREADS_VARIABLE,
+    PartResult,
+    PartTask,
+    close_workers,
+    die_with_parent,
+    run_part,
+    running_file,
+)
+
+POLL_S = 0.25
+MAX_UNEXPLAINED = 4  # deaths of a part's worker beyond what its items can explain
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    THREADS_VARIABLE,
+)
+KILLED_REASONS = {
+    "crash": "the worker died while it was at work on this item, twice",
+    "time": "the item took longer than the stage's limit, twice",
+    "memory": "the item took more memory than the stage's limit, twice",
+}
+
+
+@contextlib.contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """Environment for workers about to be spawned: native libraries read it when they load."""
+    saved = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update({name: str(count) for name in THREAD_VARIABLES})
+    try:
+        yield
+    finally:
+        for name, value in saved.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def run_parts(
+    tasks: Iterable[PartTask],
+    workers: int,
+    threads: int,
+    limits: Limits,
+    on_result: Callable[[PartResult], None],
+    log: Callable[[str], None],
+) -> None:
+    """Run all tasks on ``workers`` processes with ``threads`` native threads each; 0 workers: in this process, unprotected."""
+    if workers == 0:
+        try:
+            for task in tasks:
+                on_result(run_part(task, log=False))
+        finally:
+            close_workers()
+        return
+    waiting = iter(tasks)
+    with _threads(threads):
+        pool = ProcessPool(max_workers=workers, initializer=die_with_parent, context=multiprocessing.get_context("spawn"))
+        try:
+            _run_pool(pool, waiting, workers, limits, on_result, log)
+            pool.close()
+            pool.join()
+        except BaseException:
+            pool.stop()
+            pool.join()
+            raise
+
+
+def _run_pool(
+    pool: ProcessPool,
+    waiting: Iterator[PartTask],
+    workers: int,
+    limits: Limits,
+    on_result: Callable[[PartResult], None],
+    log: Callable[[str], None],
+) -> None:
+    flying: dict[Any, PartTask] = {}
+    verdicts: dict[str, tuple[str, str]] = {}  # part key -> (reason, detail) of the kill that we made ourselves
+    deaths: dict[str, int] = {}  # part key -> workers that died over it
+    exhausted = False
+
+    def submit(task: PartTask) -> None:
+        flying[pool.schedule(run_part, args=[task])] = task
+
+    while True:
+        while not exhausted and len(flying) < 2 * workers:
+            task = next(waiting, None)
+            if task is None:
+                exhausted = True
+            else:
+                submit(task)
+        if not flying:
+            return
+        done, _ = wait(list(flying), timeout=POLL_S, return_when=FIRST_COMPLETED)
+        for future in done:
+            task = flying.pop(future)
+            try:
+                on_result(future.result())
+            except ProcessExpired as death:
+                deaths[task.part_key] = deaths.get(task.part_key, 0) + 1
+                if deaths[task.part_key] > 2 * len(task.items) + MAX_UNEXPLAINED:
+                    raise UserError(
+                        f"{task.stage}: workers keep dying (exit code {death.exitcode}) and no item is to blame: "
+                        "look at the machine's memory and at the logs; finished parts are kept"
+                    ) from None
+                submit(_after_death(task, death, verdicts.pop(task.part_key, None), log))
+        for task in flying.values():
+            _hold_to_limits(task, limits, verdicts)
+
+
+def _after_death(
+    task: PartTask, death: ProcessExpired, verdict: tuple[str, str] | None, log: Callable[[str], None]
+) -> PartTask:
+    """The task to submit after its worker died: the suspect first, or rejected when it was the suspect already."""
+    path = running_file(task.draft, task.part_key)
+    state = _read_running(path)
+    path.unlink(missing_ok=True)
+    if state is None or state["item"] in task.killed:
+        # It died before or between items: nothing to blame but the machine. Starts as it was; each death is one line.
+        log(f"{task.stage}: a worker died (exit code {death.exitcode}) outside any item; its part starts again")
+        return task
+    item = state["item"]
+    reason, detail = verdict or ("crash", f"worker died with exit code {death.exitcode}")
+    if task.first != item:
+        log(f"{task.stage}: {item}: {detail}; trying it once more, alone")
+        return dataclasses.replace(task, first=item)
+    log(f"{task.stage}: {item}: {detail}; rejected as {reason}")
+    killed = {**task.killed, item: {"reason": reason, "detail": detail, "machine": True}}
+    return dataclasses.replace(task, first=None, killed=killed)
+
+
+def _read_running(path: Path) -> dict[str, Any] | None:
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return None
+
+
+def _hold_to_limits(task: PartTask, limits: Limits, verdicts: dict[str, tuple[str, str]]) -> None:
+    state = _read_running(running_file(task.draft, task.part_key))
+    if state is None:
+        return
+    try:
+        process = psutil.Process(state["pid"])
+        times = process.cpu_times()
+        cpu_s = times.user + times.system - state["cpu_s"]
+        memory_gb = process.memory_info().rss / 2**30
+    except psutil.Error:
+        return
+    wall_s = time.time() - state["time"]
+    if cpu_s > limits.cpu_s:
+        verdict = "time", f"over {limits.cpu_s:g} s of CPU time"
+    elif wall_s > limits.wall_s:
+        verdict = "time", f"over {limits.wall_s:g} s on the clock"
+    elif memory_gb > limits.memory_gb:
+        verdict = "memory", f"over {limits.memory_gb:g} GB of memory"
+    else:
+        return
+    verdicts[task.part_key] = verdict
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(state["pid"], signal.SIGKILL)

@@ -1,0 +1,194 @@
+"""What a stage is, and what it exchanges with the engine.
+
+A *map* stage turns items into records, in parts that workers make independently; a *run* stage writes files, resumable
+from its own checkpoints. Either gets artifacts and returns records or files; it never builds a path in the store.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pipeline.config import StageConfig
+from pipeline.errors import Reject, UserError
+
+if TYPE_CHECKING:
+    from pipeline.store import Artifact, Draft
+
+RECORD_ID = re.compile(r"[A-Za-z0-9_-]{1,120}\Z")
+MEMBER_NAME = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
+
+
+@dataclass(frozen=True)
+class Item:
+    """One unit of a map stage's work.
+
+    ``id`` is stable under more items; ``group`` (a split, say) never shares a part with another group. ``needs`` names the
+    input records that the item reads, as (input name, record id); None stands for the inputs as a whole. Items whose
+    needs are unchanged are taken over from earlier artifacts when the configuration only asks for more items.
+    """
+
+    id: str
+    group: str = ""
+    needs: tuple[tuple[str, str], ...] | None = None
+
+
+@dataclass(frozen=True)
+class Record:
+    """Named bytes: one sample of an artifact, stored as tar members ``<id>.<member>`` (the webdataset convention)."""
+
+    id: str
+    members: Mapping[str, bytes]
+
+    def __post_init__(self) -> None:
+        if not RECORD_ID.match(self.id):
+            raise ValueError(f"record id {self.id!r} may hold only letters, digits, '_' and '-', at most 120")
+        for name in self.members:
+            if not MEMBER_NAME.match(name):
+                raise ValueError(f"member name {name!r} of record {self.id} must be lower case words joined by dots")
+
+
+Inputs = Mapping[str, "Artifact"]
+
+
+class Stage:
+    """Common to both kinds. Subclasses set the class variables; instances hold no state."""
+
+    name: ClassVar[str]
+    version: ClassVar[int]  # bump when the same config gives other output
+    inputs: ClassVar[tuple[str, ...]] = ()  # names of the stages it reads
+    Config: ClassVar[Any]  # a StageConfig, or a union of them told apart by `name`
+    reasons: ClassVar[Mapping[str, str]] = {}  # closed list: reject reason -> what it means
+    headline: ClassVar[str | None] = None  # the file under files/ whose path ends a run of this stage (a report)
+
+    def slug(self, config: StageConfig) -> str:
+        """A few letters for people, at the head of the artifact's folder name."""
+        return "v" + str(self.version)
+
+    def identity(self, config: StageConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
+        """What outside the config decides the output: content hashes of local source files, revisions of remote ones.
+
+        Under the name ``items`` it may map item ids to hashes: what only that item depends on. ``hash_file(path)`` is
+        cached by path, size, mtime and inode.
+        """
+        return {}
+
+    def environment(self, config: StageConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
+        """Runtime choices that one artifact must not mix (a renderer's backend, say), as plain JSON.
+
+        ``previous`` is what an interrupted run of the same artifact chose. Return it if it still works here, else raise
+        UserError saying what to do.
+        """
+        return {}
+
+
+class MapStage(Stage):
+    """Items in, records out, in parts."""
+
+    def part_size(self, config: StageConfig) -> int:
+        """Items per part. Independent of the number of workers."""
+        return 16
+
+    def max_workers(self, config: StageConfig, environment: dict[str, Any]) -> int | None:
+        """At most this many worker processes; None for as many as the run has."""
+        return None
+
+    def items(self, config: StageConfig, inputs: Inputs) -> Iterable[Item]:
+        """All items: cheap, deterministic. The engine sorts them by (group, id)."""
+        raise NotImplementedError
+
+    def open(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any]) -> Any:
+        """A worker, built once per process: whatever `process` wants to keep (libraries, models, readers)."""
+        raise NotImplementedError
+
+    def process(self, worker: Any, item: Item) -> Iterator[Record] | Iterable[Record]:
+        """The item's records; may raise Reject."""
+        raise NotImplementedError
+
+    def finish(self, config: StageConfig, inputs: Inputs, draft: Draft) -> None:
+        """Whole-artifact files (catalogue, contact sheets, report) under ``draft.files``."""
+
+    def check(self, draft: Draft) -> None:
+        """Invariants before commit; raise UserError or AssertionError to refuse."""
+
+
+class RunStage(Stage):
+    """One long computation that writes files and resumes from its own checkpoints."""
+
+    def run(self, config: StageConfig, inputs: Inputs, draft: Draft) -> list[str]:
+        """Write products under ``draft.files``, state to resume from under ``draft.state``.
+
+        Returns the names, relative to ``draft.files``, of the files that make up the artifact's digest.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class System:
+    """A named set of stages: a DAG through their ``inputs``."""
+
+    name: str
+    modules: Mapping[str, str]  # stage name -> "package.module:Class"
+    groups: tuple[str, ...] = ()  # config groups that stages share by interpolation (``model: ${model}``)
+    packages: tuple[str, ...] = ()  # whose versions a manifest records
+    _loaded: dict[str, Stage] = field(default_factory=dict, compare=False, repr=False)
+
+    def stage(self, name: str) -> Stage:
+        """The stage of that name. Its module is imported here, so it must be cheap to import."""
+        if name not in self.modules:
+            raise UserError(f"stage={name!r} is unknown: choose from {', '.join(self.modules)}")
+        if name not in self._loaded:
+            module, _, attribute = self.modules[name].partition(":")
+            self._loaded[name] = getattr(importlib.import_module(module), attribute)()
+        return self._loaded[name]
+
+    def number(self, name: str) -> int:
+        """Position of the stage, for listings only."""
+        return list(self.modules).index(name)
+
+    def upstream(self, targets: Iterable[str]) -> list[str]:
+        """The targets and everything they read, in an order in which each stage follows its inputs."""
+        order: list[str] = []
+
+        def visit(name: str, path: tuple[str, ...]) -> None:
+            if name in path:
+                raise AssertionError(f"stages form a cycle: {' -> '.join((*path, name))}")
+            if name not in order:
+                for parent in self.stage(name).inputs:
+                    visit(parent, (*path, name))
+                order.append(name)
+
+        for target in targets:
+            visit(target, ())
+        return order
+
+
+def load_system(name: str) -> System:
+    """The engine's one dynamic import: the module ``stages.<name>``, or the dotted module ``name``, supplies ``SYSTEM``."""
+    if not re.match(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*\Z", name):
+        raise UserError(f"system={name!r} is not a name of a system")
+    module_name = name if "." in name else f"stages.{name}"
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name != module_name:
+            raise
+        raise UserError(f"system={name!r} is unknown: there is no module {module_name}") from None
+    return module.SYSTEM
+
+
+__all__ = [
+    "Inputs",
+    "Item",
+    "MapStage",
+    "Record",
+    "Reject",
+    "RunStage",
+    "Stage",
+    "StageConfig",
+    "System",
+    "load_system",
+]

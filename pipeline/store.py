@@ -1,0 +1,573 @@
+"""The content-addressed store: committed artifacts, drafts in the making, and what keeps them apart.
+
+::
+
+    store/render/<slug>-<12 hex of the key>/manifest.json items.jsonl rejects.jsonl parts/<digest>.tar files/ logs/
+    store/render/<key>.partial/      the same in the making, with markers/ (finished parts) and state/ (run stages)
+
+A committed artifact is never changed in place. Parts are written to a temporary name, flushed and renamed to their digest;
+a marker then says that the part is finished. Killing a process anywhere leaves a complete artifact or a draft that the next
+run continues.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import socket
+import threading
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from pipeline.errors import UserError
+from pipeline.files import TarWriter, hash_file, read_jsonl, sync_folder, write_atomic, write_json, write_jsonl
+from pipeline.keys import digest_of
+from pipeline.stage import Record
+
+SCHEMA = 1
+STALE_CLAIM_S = 120.0  # a claim without a heartbeat for this long is taken over
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Where one record lies: ``members`` maps a member's name to (offset, bytes) in the part's tar."""
+
+    id: str
+    item: str
+    group: str
+    part: str
+    digest: str
+    item_key: str
+    members: Mapping[str, tuple[int, int]]
+
+    def to_json(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.__slots__}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Row:
+        members = {name: (int(offset), int(size)) for name, (offset, size) in data["members"].items()}
+        return cls(data["id"], data["item"], data["group"], data["part"], data["digest"], data["item_key"], members)
+
+
+def record_digest(record: Record) -> str:
+    """Hex blake2b-256 over the names and bytes of a record's members."""
+    digest = hashlib.blake2b(digest_size=32)
+    for name in sorted(record.members):
+        data = record.members[name]
+        digest.update(f"{len(name)}:{name}:{len(data)}:".encode())
+        digest.update(data)
+    return digest.hexdigest()
+
+
+class _Records:
+    """Rows and their bytes: what drafts and artifacts have in common."""
+
+    path: Path
+
+    def rows(self) -> list[Row]:
+        raise NotImplementedError
+
+    @cached_property
+    def _by_id(self) -> dict[str, Row]:
+        return {row.id: row for row in self.rows()}
+
+    def __contains__(self, record_id: str) -> bool:
+        return record_id in self._by_id
+
+    def row(self, record_id: str) -> Row:
+        try:
+            return self._by_id[record_id]
+        except KeyError:
+            raise UserError(f"there is no record {record_id!r} in {self.path}") from None
+
+    def ids(self, group: str | None = None) -> list[str]:
+        return [row.id for row in self.rows() if group is None or row.group == group]
+
+    def groups(self) -> list[str]:
+        return sorted({row.group for row in self.rows()})
+
+    def part_path(self, digest: str) -> Path:
+        return self.path / "parts" / f"{digest}.tar"
+
+    def part_of(self, record_id: str) -> tuple[Path, str]:
+        """The tar that holds the record, and its group."""
+        row = self.row(record_id)
+        return self.part_path(row.part), row.group
+
+    def read(self, record_id: str) -> Record:
+        """One record: one open, one seek per member."""
+        row = self.row(record_id)
+        with open(self.part_path(row.part), "rb") as file:
+            members = {}
+            for name, (offset, size) in row.members.items():
+                file.seek(offset)
+                data = file.read(size)
+                if len(data) != size:
+                    raise UserError(f"{self.part_path(row.part)} is truncated at {name} of {row.id}: run `lightmill verify`")
+                members[name] = data
+        return Record(row.id, members)
+
+
+class Artifact(_Records):
+    """A committed artifact: read only."""
+
+    def __init__(self, path: Path):
+        self.path = Path(path)
+
+    def __repr__(self) -> str:
+        return f"Artifact({self.stage}/{self.path.name})"
+
+    def __reduce__(self) -> tuple[type, tuple[Path]]:
+        return Artifact, (self.path,)  # workers reopen by path: cheap to send
+
+    @cached_property
+    def manifest(self) -> dict[str, Any]:
+        try:
+            return json.loads((self.path / "manifest.json").read_bytes())
+        except (OSError, ValueError) as error:
+            raise UserError(f"{self.path}/manifest.json cannot be read ({error}): delete the folder and run again") from None
+
+    @property
+    def key(self) -> str:
+        return self.manifest["key"]
+
+    @property
+    def stage(self) -> str:
+        return self.manifest["preimage"]["stage"]
+
+    @property
+    def digest(self) -> str:
+        return self.manifest["outputs"]["digest"]
+
+    @cached_property
+    def _rows(self) -> list[Row]:
+        return [Row.from_json(row) for row in read_jsonl(self.path / "items.jsonl")]
+
+    def rows(self) -> list[Row]:
+        """All rows, sorted by (group, item)."""
+        return self._rows
+
+    def rejects(self) -> list[dict[str, Any]]:
+        return read_jsonl(self.path / "rejects.jsonl")
+
+    def file(self, name: str) -> Path:
+        """Path of ``files/<name>``."""
+        path = self.path / "files" / name
+        if not path.exists():
+            raise UserError(f"{self.path} has no file {name}")
+        return path
+
+    def verify(self, deep: bool = False) -> list[str]:
+        """What is wrong with it, as lines; ``deep`` reads every byte. Empty means sound."""
+        problems = []
+        outputs = self.manifest["outputs"]
+        for part in outputs["parts"]:
+            path = self.part_path(part["digest"])
+            if not path.is_file():
+                problems.append(f"parts/{path.name} is missing ({len(part['items'])} items)")
+            elif path.stat().st_size != part["bytes"]:
+                problems.append(f"parts/{path.name} has {path.stat().st_size} bytes, not {part['bytes']}")
+            elif deep and hash_file(path) != part["digest"]:
+                problems.append(f"parts/{path.name} does not hash to its name")
+        for name, entry in outputs["files"].items():
+            path = self.path / "files" / name
+            if not path.is_file() or path.stat().st_size != entry["bytes"]:
+                problems.append(f"files/{name} is missing or has another size than {entry['bytes']} bytes")
+            elif deep and hash_file(path) != entry["digest"]:
+                problems.append(f"files/{name} does not hash to {entry['digest'][:12]}")
+        for name, expected in outputs["listings"].items():
+            path = self.path / name
+            if not path.is_file() or hash_file(path) != expected:
+                problems.append(f"{name} is missing or changed")
+        if digest_of(self.manifest["preimage"]) != self.key:
+            problems.append("manifest.json: the key is not the hash of its preimage")
+        return problems
+
+
+class Claim:
+    """An advisory lock: host, pid and a heartbeat. Losing one wastes work, never corrupts."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._stop = threading.Event()
+        self._me = {"host": socket.gethostname(), "pid": os.getpid(), "started": psutil.Process().create_time()}
+
+    def holder(self) -> dict[str, Any] | None:
+        """Who holds it, if that process still lives (as far as can be told)."""
+        try:
+            other = json.loads(self.path.read_bytes())
+            age = time.time() - self.path.stat().st_mtime
+        except (OSError, ValueError):
+            return None
+        if other == self._me:
+            return None
+        if other["host"] == self._me["host"]:
+            try:
+                alive = abs(psutil.Process(other["pid"]).create_time() - other["started"]) < 1.0
+            except psutil.Error:
+                alive = False
+            return other if alive else None
+        return other if age < STALE_CLAIM_S else None
+
+    def take(self) -> None:
+        write_json(self.path, self._me)
+
+        def beat() -> None:
+            while not self._stop.wait(STALE_CLAIM_S / 8):
+                try:
+                    os.utime(self.path)
+                except OSError:
+                    return
+
+        threading.Thread(target=beat, daemon=True).start()
+
+    def release(self) -> None:
+        self._stop.set()
+        self.path.unlink(missing_ok=True)
+
+
+class Draft(_Records):
+    """An artifact in the making. Everything in it survives a kill; the next run continues with what is finished."""
+
+    def __init__(self, path: Path, stage: str, key: str, preimage: Mapping[str, Any], out: Any = print):
+        self.path = path
+        self.stage = stage
+        self.key = key
+        self.preimage = dict(preimage)
+        self.summary: dict[str, Any] = {}
+        self._out = out
+        self._whole_rejects: list[dict[str, Any]] = []
+        for folder in ("parts", "markers", "files", "state", "logs", "running"):
+            (path / folder).mkdir(parents=True, exist_ok=True)
+
+    files = property(lambda self: self.path / "files")
+    state = property(lambda self: self.path / "state")
+    logs = property(lambda self: self.path / "logs")
+
+    def log(self, text: str) -> None:
+        """A line in the run's output."""
+        self._out(text)
+
+    def note(self, name: str, value: Any) -> None:
+        """A small JSON summary for the manifest, shown by ``lightmill show``."""
+        self.summary[name] = value
+
+    def reject(self, item: str, reason: str, detail: str = "") -> None:
+        """Reject an item for what only the whole artifact shows (a duplicate, say). Its record stays in the parts."""
+        self._whole_rejects.append({"item": item, "group": "", "reason": reason, "detail": detail, "whole": True})
+
+    # -- environment: runtime choices that one artifact must not mix
+
+    def environment(self) -> dict[str, Any] | None:
+        path = self.path / "environment.json"
+        return json.loads(path.read_bytes()) if path.is_file() else None
+
+    def set_environment(self, environment: Mapping[str, Any]) -> None:
+        write_json(self.path / "environment.json", environment)
+
+    # -- parts
+
+    def marker(self, part_key: str) -> dict[str, Any] | None:
+        """The finished part of that key, or None; a marker whose file is missing or cut does not count."""
+        path = self.path / "markers" / f"{part_key}.json"
+        try:
+            marker = json.loads(path.read_bytes())
+            if marker["digest"] is not None and self.part_path(marker["digest"]).stat().st_size != marker["bytes"]:
+                return None
+            return marker
+        except (OSError, ValueError):
+            return None
+
+    def finish_part(self, part_key: str, marker: Mapping[str, Any]) -> None:
+        write_json(self.path / "markers" / f"{part_key}.json", marker)
+
+    def open_part(self) -> PartWriter:
+        return PartWriter(self)
+
+    def link_part(self, source: Path, part_key: str, marker: Mapping[str, Any]) -> None:
+        """Take over a finished part of an earlier artifact by hard link (a copy where links are not possible)."""
+        if marker["digest"] is not None:
+            target = self.part_path(marker["digest"])
+            if not target.exists():
+                temporary = target.with_name(f".{uuid.uuid4().hex[:8]}.tmp")
+                try:
+                    os.link(source, temporary)
+                except OSError:
+                    shutil.copyfile(source, temporary)
+                os.replace(temporary, target)
+        self.finish_part(part_key, marker)
+
+    def use_parts(self, markers: Iterable[Mapping[str, Any]]) -> None:
+        """The markers, in order, that make up the artifact: from here on rows and rejects can be read."""
+        self._markers = list(markers)
+        self._rows = [Row.from_json(row) for marker in self._markers for row in marker["rows"]]
+        self.__dict__.pop("_by_id", None)
+        seen: dict[str, str] = {}
+        for row in self._rows:
+            if row.id in seen:
+                raise UserError(f"items {seen[row.id]!r} and {row.item!r} both made a record {row.id!r}")
+            seen[row.id] = row.item
+
+    def rows(self) -> list[Row]:
+        return self._rows
+
+    def rejects(self) -> list[dict[str, Any]]:
+        return [reject for marker in self._markers for reject in marker["rejects"]] + self._whole_rejects
+
+    # -- commit
+
+    def outputs(self, products: Iterable[str] = ()) -> dict[str, Any]:
+        """The manifest's ``outputs``: parts, items, rejects, bytes, and the digest over records and products."""
+        write_jsonl(self.path / "items.jsonl", (row.to_json() for row in self._rows))
+        rejects = self.rejects()
+        write_jsonl(self.path / "rejects.jsonl", rejects)
+        parts = [
+            {name: marker[name] for name in ("part_key", "digest", "bytes", "group", "items")}
+            for marker in self._markers
+            if marker["digest"] is not None
+        ]
+        files = {}
+        for path in sorted(self.files.rglob("*")):
+            if path.is_file():
+                name = path.relative_to(self.files).as_posix()
+                files[name] = {"bytes": path.stat().st_size, "digest": hash_file(path)}
+        reasons: dict[str, int] = {}
+        for reject in rejects:
+            reasons[reject["reason"]] = reasons.get(reject["reason"], 0) + 1
+        digest = digest_of(
+            {
+                "parts": [[part["group"], part["digest"]] for part in parts],
+                "rejects": [[r["group"], r["item"], r["reason"]] for r in rejects if not r.get("machine")],
+                "products": [[name, files[name]["digest"]] for name in sorted(products)],
+            }
+        )
+        return {
+            "digest": digest,
+            "records": len(self._rows),
+            "items": sum(len(marker["items"]) for marker in self._markers),
+            "rejects": reasons,
+            "bytes": sum(part["bytes"] for part in parts) + sum(entry["bytes"] for entry in files.values()),
+            "parts": parts,
+            "empty_parts": [
+                {name: marker[name] for name in ("part_key", "group", "items")}
+                for marker in self._markers
+                if marker["digest"] is None
+            ],
+            "files": files,
+            "listings": {name: hash_file(self.path / name) for name in ("items.jsonl", "rejects.jsonl")},
+        }
+
+
+class PartWriter:
+    """Writes one part under a temporary name; ``close`` renames it to its digest."""
+
+    def __init__(self, draft: Draft):
+        self._draft = draft
+        self._path = draft.path / "parts" / f".{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp"
+        self._file = open(self._path, "wb")  # noqa: SIM115 - closed in close or discard
+        self._tar = TarWriter(self._file)
+        self._rows: list[dict[str, Any]] = []
+
+    def add(self, record: Record, item: str, group: str, item_key: str) -> None:
+        members = {name: (self._tar.add(f"{record.id}.{name}", data), len(data)) for name, data in record.members.items()}
+        self._rows.append(Row(record.id, item, group, "", record_digest(record), item_key, members).to_json())
+
+    def close(self) -> dict[str, Any]:
+        """Flush, rename; returns the marker's ``digest``, ``bytes`` and ``rows``. A part without records has no file."""
+        digest = self._tar.close()
+        if not self._rows:
+            self.discard()
+            return {"digest": None, "bytes": 0, "rows": []}
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        os.replace(self._path, self._draft.part_path(digest))
+        sync_folder(self._path.parent)
+        for row in self._rows:
+            row["part"] = digest
+        return {"digest": digest, "bytes": self._tar.size, "rows": self._rows}
+
+    def discard(self) -> None:
+        self._file.close()
+        self._path.unlink(missing_ok=True)
+
+
+class Store:
+    """A folder of artifacts."""
+
+    def __init__(self, root: Path | str):
+        self.root = Path(root).absolute()
+
+    # -- finding
+
+    def find(self, stage: str, key: str) -> Artifact | None:
+        for path in (self.root / stage).glob(f"*-{key[:12]}"):
+            if (path / "manifest.json").is_file() and Artifact(path).key == key:
+                return Artifact(path)
+        return None
+
+    def artifacts(self, stage: str | None = None) -> list[Artifact]:
+        """All committed artifacts, oldest first."""
+        found = [Artifact(path.parent) for path in self.root.glob(f"{stage or '[!.]*'}/[!.]*/manifest.json")]
+        found = [artifact for artifact in found if not artifact.path.name.endswith(".partial")]
+        return sorted(found, key=lambda artifact: (artifact.manifest["finished"], str(artifact.path)))
+
+    def drafts(self) -> list[Path]:
+        return sorted(self.root.glob("[!.]*/*.partial"))
+
+    def resolve(self, reference: str) -> Artifact:
+        """The artifact that a person means: a key or its beginning, ``stage/folder``, a folder, or a stage's newest."""
+        path = Path(reference)
+        if (path / "manifest.json").is_file():
+            return Artifact(path)
+        if (self.root / reference / "manifest.json").is_file() and ".." not in path.parts:
+            return Artifact(self.root / reference)
+        stage, _, rest = reference.rpartition("/")
+        if not stage and (newest := self.artifacts(reference) if reference.isidentifier() else []):
+            return newest[-1]
+        token = rest.rpartition("-")[2]
+        found = [a for a in self.artifacts(stage or None) if len(token) >= 4 and a.key.startswith(token)]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise UserError(f"{reference!r} is the beginning of {len(found)} keys: give more letters")
+        raise UserError(f"no artifact {reference!r} in {self.root}: `lightmill ls` lists what is there")
+
+    # -- making
+
+    def draft(self, stage: str, key: str, preimage: Mapping[str, Any], out: Any = print) -> Draft:
+        """A new draft, or the one that an interrupted run left."""
+        path = self.root / stage / f"{key}.partial"
+        try:
+            draft = Draft(path, stage, key, preimage, out)
+        except OSError as error:
+            raise UserError(f"cannot write to the store at {self.root}: {error.strerror} ({error.filename})") from None
+        if not (path / "draft.json").is_file():
+            write_json(path / "draft.json", {"key": key, "preimage": draft.preimage, "started": time.time()})
+        return draft
+
+    def claim(self, stage: str, key: str) -> Claim:
+        return Claim(self.root / stage / f".{key}.claim")
+
+    def commit(self, draft: Draft, slug: str, manifest: Mapping[str, Any], replace: bool = False) -> Artifact:
+        """Make the draft an artifact by one rename.
+
+        If the target exists by then, ours is dropped, or swapped in on ``replace``.
+        """
+        used = {marker["digest"] for marker in draft._markers}
+        for path in (draft.path / "parts").iterdir():
+            if path.suffix != ".tar" or path.stem not in used:
+                path.unlink()  # orphans: temporaries of killed workers, parts of another plan
+        write_json(draft.path / "manifest.json", manifest)
+        for folder in ("parts", "files", "."):
+            sync_folder(draft.path / folder)
+        target = self.root / draft.stage / f"{slug}-{draft.key[:12]}"
+        existing = self.find(draft.stage, draft.key)
+        if existing is not None and not replace and not existing.verify():
+            shutil.rmtree(draft.path)
+        else:
+            if existing is not None:
+                trash = self.root / ".trash"
+                trash.mkdir(exist_ok=True)
+                os.replace(existing.path, trash / f"{draft.stage}-{existing.path.name}-{uuid.uuid4().hex[:8]}")
+            os.replace(draft.path, target)
+            sync_folder(target.parent)
+            existing = Artifact(target)
+            for folder in ("markers", "running", "state"):  # only now: until the rename they are what a resume needs
+                shutil.rmtree(target / folder, ignore_errors=True)
+        self.touch(existing.key)
+        return existing
+
+    # -- use, pins, garbage
+
+    def touch(self, key: str) -> None:
+        """Remember that the artifact was used just now (outside the artifact, which never changes)."""
+        path = self.root / ".used" / key
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+        except OSError:
+            pass  # a read-only store can still be read
+
+    def last_used(self, artifact: Artifact) -> float:
+        path = self.root / ".used" / artifact.key
+        return path.stat().st_mtime if path.exists() else artifact.manifest["finished"]
+
+    def pinned(self, key: str) -> bool:
+        return (self.root / ".pins" / key).exists()
+
+    def pin(self, key: str, on: bool = True) -> None:
+        path = self.root / ".pins" / key
+        if on:
+            write_atomic(path, b"")
+        else:
+            path.unlink(missing_ok=True)
+
+    def garbage(self, days: float) -> list[tuple[Path, str]]:
+        """What can go, with the reason: trash, drafts nobody works on, and artifacts nobody needs.
+
+        An artifact is needed while it is pinned, was used within ``days``, or is an input of one that is needed.
+        """
+        horizon = time.time() - days * 86400
+        found: list[tuple[Path, str]] = [(path, "replaced by a forced rerun") for path in self.root.glob(".trash/*")]
+        for path in self.drafts():
+            claim = self.claim(path.parent.name, path.name.removesuffix(".partial"))
+            if claim.holder() is None and (path / "markers").exists() and (path / "markers").stat().st_mtime < horizon:
+                found.append((path, f"unfinished and untouched for {days:g} days"))
+        artifacts = self.artifacts()
+        keep = {a.key for a in artifacts if self.pinned(a.key) or self.last_used(a) >= horizon}
+        for artifact in reversed(artifacts):  # newest first, so that inputs of kept ones are kept in one pass
+            if artifact.key in keep:
+                keep |= set(artifact.manifest["preimage"]["inputs"].values())
+        found += [(a.path, f"not pinned, not used for {days:g} days") for a in artifacts if a.key not in keep]
+        for artifact in artifacts:
+            found += [
+                (artifact.path / name, "left over by a commit that was interrupted")
+                for name in ("markers", "running", "state")
+                if artifact.key in keep and (artifact.path / name).exists()
+            ]
+        return found
+
+
+class HashCache:
+    """Content hashes of local files, remembered by path, size, mtime and inode; the cache itself is no part of any key."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        try:
+            self._known: dict[str, list[Any]] = json.loads(path.read_bytes())
+        except (OSError, ValueError):
+            self._known = {}
+        self._changed = False
+
+    def __call__(self, path: Path | str) -> str:
+        path = Path(path).absolute()
+        stat = path.stat()
+        stamp = [stat.st_size, stat.st_mtime_ns, stat.st_ino]
+        entry = self._known.get(str(path))
+        if entry is None or entry[:3] != stamp:
+            entry = [*stamp, hash_file(path)]
+            self._known[str(path)] = entry
+            self._changed = True
+        return entry[3]
+
+    def save(self) -> None:
+        if self._changed:
+            with contextlib.suppress(OSError):  # only a cache
+                write_json(self._path, self._known)
+
+
+def iter_inputs(store: Store, artifact: Artifact) -> Iterator[tuple[str, str, Artifact | None]]:
+    """(input name, key, artifact or None if it is gone) of each input."""
+    for name, key in artifact.manifest["preimage"]["inputs"].items():
+        yield name, key, store.find(name, key)

@@ -1,0 +1,1 @@
+"""What each numbered stage does, the records they exchange, and the ``lightmill`` command."""

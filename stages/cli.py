@@ -1,0 +1,156 @@
+"""The ``lightmill`` command: run, the store's commands, and trace, predict, compare for single scenes and images.
+
+Heavy libraries are imported by the command that needs them, so that ``lightmill ls`` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.commands import add_commands
+from pipeline.errors import UserError
+
+PROGRAM = "lightmill"
+
+
+def command_run(arguments: argparse.Namespace) -> int:
+    from pipeline.__main__ import main as run_main
+
+    words = list(arguments.words)
+    return run_main([*words, "--debug"] if arguments.debug else words)
+
+
+def command_trace(arguments: argparse.Namespace) -> int:
+    from stages.trace import trace
+
+    for path in trace(
+        Path(arguments.scene),
+        Path(arguments.out),
+        resolution=arguments.resolution,
+        spp=arguments.spp,
+        mode=arguments.mode,
+        denoise=arguments.denoise,
+        seed=arguments.seed,
+        view=arguments.view,
+    ):
+        print(path)
+    return 0
+
+
+def checkpoint_folder(reference: str, store: str) -> Path:
+    """A released-format checkpoint folder as given, or that of a train artifact in the store."""
+    if (Path(reference) / "config.json").is_file():
+        return Path(reference)
+    if Path(reference).is_dir() and not (Path(reference) / "manifest.json").is_file():
+        raise UserError(f"{reference} is no checkpoint folder: it has no config.json (and no model.safetensors beside it)")
+    from pipeline.store import Store
+
+    artifact = Store(store).resolve(reference)
+    if artifact.stage != "train":
+        raise UserError(f"{reference} is an artifact of stage {artifact.stage}: give one of stage train, or a checkpoint folder")
+    return artifact.file("checkpoint")
+
+
+def command_predict(arguments: argparse.Namespace) -> int:
+    from stages.predict import predict
+
+    for path in predict(
+        Path(arguments.scene),
+        checkpoint_folder(arguments.checkpoint, arguments.store),
+        Path(arguments.out),
+        resolution=arguments.resolution,
+        view=arguments.view,
+        device=arguments.device,
+    ):
+        print(path)
+    return 0
+
+
+def command_compare(arguments: argparse.Namespace) -> int:
+    from stages.compare import compare, table
+
+    metrics = compare(Path(arguments.a), Path(arguments.b))
+    print(json.dumps(metrics, indent=1) if arguments.json else table(metrics))
+    return 0
+
+
+def view_argument(text: str) -> int | str:
+    if text == "all":
+        return text
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor 'all'") from None
+
+
+def build_parser() -> argparse.ArgumentParser:
+    debug = argparse.ArgumentParser(add_help=False)
+    debug.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    parser = argparse.ArgumentParser(
+        PROGRAM, description="Make data for, train and evaluate neural renderers of triangle meshes.", parents=[debug]
+    )
+    parsers = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def add(name: str, function, summary: str, example: str) -> argparse.ArgumentParser:
+        sub = parsers.add_parser(name, help=summary, description=summary, epilog=f"example: {PROGRAM} {name} {example}")
+        sub.set_defaults(function=function)
+        return sub
+
+    sub = add("run", command_run, "run stages (the same as python -m pipeline)", "stage=shard scene.count.train=200")
+    sub.add_argument("words", nargs=argparse.REMAINDER, help="overrides, -m for a sweep")
+    add_commands(parsers, PROGRAM)
+
+    sub = add("trace", command_trace, "path trace a scene given as released JSON or HDF5", "scene.json -o out.exr --spp 256")
+    sub.add_argument("scene", help="scene file: .json or .h5")
+    sub.add_argument("-o", "--out", required=True, help="output .exr (linear RGB float); with --view all: OUT-0.exr, OUT-1.exr")
+    sub.add_argument("--resolution", type=int, default=512, help="pixels per side (default: 512)")
+    sub.add_argument("--spp", type=int, default=256, help="samples per pixel (default: 256)")
+    sub.add_argument("--mode", choices=("physical", "cycles"), default="physical", help="what the renderer matches")
+    sub.add_argument("--denoise", action=argparse.BooleanOptionalAction, default=True, help="Open Image Denoise (default: on)")
+    sub.add_argument("--seed", type=int, default=0)
+    sub.add_argument("--view", type=view_argument, default=0, help="camera number, or 'all' (default: 0)")
+
+    sub = add(
+        "predict", command_predict, "render a scene with a trained model", "scene.json --checkpoint train -o out.png"
+    )  # fmt: skip
+    sub.add_argument("scene", help="scene file: .json or .h5")
+    sub.add_argument("--checkpoint", required=True, help="released-format folder, or a train artifact's key, name or 'train'")
+    sub.add_argument("-o", "--out", required=True, help="output .exr (linear) or .png (tone-mapped)")
+    sub.add_argument("--resolution", type=int, default=512, help="pixels per side, divisible by 8 (default: 512)")
+    sub.add_argument("--view", type=view_argument, default=0, help="camera number, or 'all' (default: 0)")
+    sub.add_argument("--device", default="auto", help="cpu, cuda or auto (default)")
+    sub.add_argument("--store", default="store", help="the store's folder (default: store)")
+
+    sub = add("compare", command_compare, "the metrics between two images, A the reference", "reference.exr out.exr --json")
+    sub.add_argument("a", help="reference: .exr or .png")
+    sub.add_argument("b", help="test image of the same size")
+    sub.add_argument("--json", action="store_true", help="print JSON")
+    for sub in parsers.choices.values():
+        sub.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show the traceback of an error")
+    return parser
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Returns the exit status: 0, 1 for what a check found, 2 for an error that the user can mend."""
+    arguments = build_parser().parse_args(words)
+    try:
+        return arguments.function(arguments)
+    except (ValueError, OSError) as error:
+        if arguments.debug:
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 0
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

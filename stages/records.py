@@ -1,0 +1,139 @@
+"""The records that stages exchange: shapes, dtypes, units and frames, in one place.
+
+Frames: a scene is one unit, its content inside [-0.5, 0.5]^3, z up, right-handed. Cameras look along -z with +y up and +x
+right; ``camera_to_world`` is a rigid 4x4. Radiance is linear, in scene-linear RGB, without units. F triangles, V views,
+L lights, H x W pixels with row 0 on top.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pipeline.stage import Record
+from stages.arrays import pack_arrays, pack_json, unpack_arrays, unpack_json
+
+# The 13 channels of a RenderFormer triangle patch and where they start, in the released order (section 3, item 1).
+PATCH_CHANNELS: Mapping[str, slice] = {
+    "diffuse": slice(0, 3),
+    "specular": slice(3, 6),
+    "roughness": slice(6, 7),
+    "normal": slice(7, 10),
+    "emission": slice(10, 13),
+}
+PATCH_NORMAL = (0.5, 0.5, 1.0)  # the released format's constant tangent-space normal
+
+
+@dataclass
+class MeshRecord:
+    """One object as a triangle mesh.
+
+    vertices: (V, 3) float32. After *collect* the bounding box is centred on the origin and its longest side is 1; later
+        stages keep that frame.
+    faces: (F, 3) int32, counter-clockwise seen from outside.
+    meta: JSON. ``object_id``, ``content_hash``, ``source``, ``origin``, ``licence``, ``family`` and the stage's measures.
+    """
+
+    id: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    def to_record(self) -> Record:
+        arrays = {"vertices": self.vertices.astype(np.float32), "faces": self.faces.astype(np.int32)}
+        return Record(self.id, {"mesh.npz": pack_arrays(arrays), "meta.json": pack_json(self.meta)})
+
+    @classmethod
+    def from_record(cls, record: Record) -> MeshRecord:
+        arrays = unpack_arrays(record.members["mesh.npz"])
+        return cls(record.id, arrays["vertices"], arrays["faces"], unpack_json(record.members["meta.json"]))
+
+
+@dataclass
+class SceneRecord:
+    """A scene as the renderer and the model see it: the same arrays for both.
+
+    triangles: (F, 3, 3) float32, world space, scene units.
+    vertex_normals: (F, 3, 3) float32, unit shading normals per corner, world space.
+    diffuse: (F, 3) float32 in [0, 1]. specular: (F, 3) float32 in [0, 1]. roughness: (F,) float32 in [0.01, 1],
+        GGX alpha = roughness^2. BSDF = diffuse / pi + specular * GGX, no Fresnel term.
+    emission: (F, 3) float32, radiance >= 0, both sides emit. An emitting triangle reflects nothing.
+    light_index: (F,) int16, -1 where a triangle does not emit, else the light (0..L-1) that it belongs to.
+    object_index: (F,) int16 into ``meta["objects"]`` (walls, objects and lights).
+    camera_to_world: (V, 4, 4) float32. fov_deg: (V,) float32, full angle of the square image.
+    meta: JSON. ``template``, ``law``, ``split``, ``objects`` [{name, kind: wall|object|light, object_id?, faces}].
+    """
+
+    id: str
+    triangles: np.ndarray
+    vertex_normals: np.ndarray
+    diffuse: np.ndarray
+    specular: np.ndarray
+    roughness: np.ndarray
+    emission: np.ndarray
+    light_index: np.ndarray
+    object_index: np.ndarray
+    camera_to_world: np.ndarray
+    fov_deg: np.ndarray
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    DTYPES = {
+        "triangles": np.float32,
+        "vertex_normals": np.float32,
+        "diffuse": np.float32,
+        "specular": np.float32,
+        "roughness": np.float32,
+        "emission": np.float32,
+        "light_index": np.int16,
+        "object_index": np.int16,
+        "camera_to_world": np.float32,
+        "fov_deg": np.float32,
+    }
+
+    @property
+    def n_lights(self) -> int:
+        """L, the number of lights."""
+        return int(self.light_index.max(initial=-1)) + 1
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {name: np.asarray(getattr(self, name)).astype(dtype) for name, dtype in self.DTYPES.items()}
+
+    def to_record(self) -> Record:
+        return Record(self.id, {"scene.npz": pack_arrays(self.arrays()), "meta.json": pack_json(self.meta)})
+
+    @classmethod
+    def from_members(cls, id: str, members: Mapping[str, bytes]) -> SceneRecord:
+        """From the members ``scene.npz`` and ``meta.json``, of a record or of a shard's sample."""
+        return cls(id, **unpack_arrays(members["scene.npz"]), meta=unpack_json(members["meta.json"]))
+
+    @classmethod
+    def from_record(cls, record: Record) -> SceneRecord:
+        return cls.from_members(record.id, record.members)
+
+
+@dataclass
+class ViewRecord:
+    """What the path tracer saw from one camera. Stored as one multi-layer half-float EXR (see ``stages.exr``).
+
+    lights: (L, H, W, 3) float32 radiance, one layer per light; the image is their sum (light transport is linear).
+    direct: (H, W, 3) float32 radiance that reached the camera after at most one bounce, summed over lights.
+    albedo: (H, W, 3) float32, diffuse + specular at the first hit. normal: (H, W, 3) float32, world-space shading normal.
+    depth: (H, W) float32, distance along the ray in scene units, 0 where nothing was hit. coverage: (H, W) float32 in [0, 1].
+    meta: JSON. ``index`` (camera), ``status`` ok|dark|too_close, ``mean``, ``nearest``, ``spp``, ``clamped`` half-floats.
+    """
+
+    lights: np.ndarray
+    direct: np.ndarray
+    albedo: np.ndarray
+    normal: np.ndarray
+    depth: np.ndarray
+    coverage: np.ndarray
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def image(self) -> np.ndarray:
+        """(H, W, 3) float32 radiance, all lights on."""
+        return self.lights.sum(axis=0)

@@ -1,0 +1,267 @@
+"""What would break for a user of the engine: keys, reuse, growth, faults, kills, the commands."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tarfile
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline import commands
+from pipeline.config import Section, added, parse, runtime
+from pipeline.errors import UserError
+from pipeline.keys import canonical, canonical_json, seed_for
+from pipeline.runner import run_pipeline
+from pipeline.stage import Record
+from pipeline.store import Store
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def run(tmp_path):
+    """run(numbers={...}, ...) -> (artifacts by stage, lines printed)."""
+
+    def go(workers: int = 0, **overrides):
+        lines: list[str] = []
+        root = {"system": "tests.pipeline.toy", "stage": "total", "store": str(tmp_path / "store"), "workers": workers}
+        root |= {"numbers": {}, "squares": {}, "total": {}} | overrides
+        result = run_pipeline(root, ["test"], lines.append)
+        return result["artifacts"], lines
+
+    return go
+
+
+def contents(artifacts):
+    return {name: artifact.digest for name, artifact in artifacts.items()}
+
+
+# -- keys and configs
+
+
+class Example(Section):
+    rate: float = 1.0
+    device: str = runtime("cpu")
+    later: int = added(5, legacy=5)
+
+
+def test_key_holds_what_decides_the_output_and_nothing_else():
+    assert canonical(Example(rate=2, device="cuda")) == {"rate": 2.0}
+    assert canonical(Example(later=6)) == {"rate": 1.0, "later": 6}
+    assert canonical_json({"b": 1, "a": (1, 2.0)}) == b'{"a":[1,2.0],"b":1}'
+
+
+@pytest.mark.parametrize("value", [float("nan"), object(), {1: 2}, b"bytes", Path("/x")])
+def test_key_refuses_what_has_no_canonical_form(value):
+    with pytest.raises(TypeError):
+        canonical(value)
+
+
+def test_unknown_key_names_the_nearest():
+    with pytest.raises(UserError, match="did you mean 'rate'"):
+        parse(Example, {"rte": 1}, "example")
+    with pytest.raises(UserError, match="example.rate"):
+        parse(Example, {"rate": "fast"}, "example")
+
+
+def test_seed_depends_on_the_item_not_on_the_others():
+    assert seed_for(0, "scene", "a") == seed_for(0, "scene", "a")
+    assert len({seed_for(s, n, i) for s in (0, 1) for n in ("x", "y") for i in ("a", "b")}) == 8
+
+
+@pytest.mark.parametrize("name", ["../x", "a/b", "", "a.b", "x" * 121])
+def test_record_ids_cannot_leave_their_folder(name):
+    with pytest.raises(ValueError):
+        Record(name, {})
+
+
+# -- running
+
+
+def test_second_run_computes_nothing(run):
+    first, _ = run()
+    second, lines = run()
+    assert contents(first) == contents(second)
+    assert all("up to date" in line for line in lines if line[:2].isdigit())
+
+
+def test_worker_count_does_not_change_bytes(run, tmp_path):
+    serial, _ = run(workers=0)
+    other, _ = run(workers=2, store=str(tmp_path / "other"))
+    assert contents(serial) == contents(other)
+
+
+def test_more_items_compute_only_the_new_ones(run, tmp_path):
+    log = tmp_path / "computed"
+    run(squares={"log_to": str(log)})
+    assert len(log.read_text().split()) == 10
+    log.unlink()
+    grown, _ = run(numbers={"n": 15}, squares={"log_to": str(log)})
+    assert sorted(log.read_text().split()) == ["n010", "n011", "n012", "n014"]  # n013 is rejected upstream
+    fresh, _ = run(numbers={"n": 15}, store=str(tmp_path / "fresh"))
+    assert contents(grown) == contents(fresh)
+
+
+def test_one_changed_parameter_reruns_its_stage_and_what_follows(run):
+    before, _ = run()
+    after, _ = run(squares={"offset": 1})
+    assert before["numbers"].key == after["numbers"].key
+    assert before["squares"].key != after["squares"].key
+    assert before["total"].key != after["total"].key
+
+
+def test_force_reports_equal(run):
+    run()
+    _, lines = run(force="squares")
+    assert any("squares" in line and "equal to before" in line for line in lines)
+
+
+def test_rejects_are_recorded_with_their_reason(run):
+    artifacts, _ = run(numbers={"n": 15})
+    (reject,) = artifacts["numbers"].rejects()
+    assert (reject["item"], reject["reason"], reject["detail"]) == ("n013", "unlucky", "it is thirteen")
+    with pytest.raises(UserError, match="1 unlucky"):
+        run(numbers={"n": 15, "max_reject_share": 0.01, "scale": 2})
+
+
+def test_parts_are_plain_webdataset_tars(run):
+    artifacts, _ = run()
+    squares = artifacts["squares"]
+    path, _ = squares.part_of("n004")
+    with tarfile.open(path) as tar:
+        members = {member.name: member for member in tar.getmembers()}
+        assert members["n004.square.txt"].mtime == 0
+        data = tar.extractfile("n004.square.txt").read()
+    assert data == squares.read("n004").members["square.txt"]
+    assert not [name for name in members if squares.row(name.split(".")[0]).group != squares.row("n004").group]
+
+
+# -- faults
+
+
+def test_crash_rejects_the_item_alone(run):
+    artifacts, lines = run(workers=2, numbers={"n": 12, "crash": ["n005"]})
+    (reject,) = artifacts["numbers"].rejects()
+    assert (reject["item"], reject["reason"], reject["machine"]) == ("n005", "crash", True)
+    assert len(artifacts["numbers"].rows()) == 11
+
+
+def test_a_worker_killed_once_costs_nothing(run, tmp_path):
+    (tmp_path / "once").mkdir()
+    killed, _ = run(workers=2, numbers={"n": 12, "crash_once": str(tmp_path / "once")})
+    undisturbed, _ = run(numbers={"n": 12}, store=str(tmp_path / "fresh"))
+    assert (tmp_path / "once" / "mark").exists()
+    assert contents(killed) == contents(undisturbed)
+
+
+@pytest.mark.parametrize(
+    ("kind", "limits", "reason"), [("hang", {"cpu_s": 0.5}, "time"), ("greedy", {"memory_gb": 0.4}, "memory")]
+)
+def test_limits_reject_the_item_alone(run, kind, limits, reason):
+    artifacts, _ = run(workers=1, stage="numbers", numbers={"n": 6, kind: ["n003"], "limits": limits})
+    assert [(r["item"], r["reason"]) for r in artifacts["numbers"].rejects()] == [("n003", reason)]
+
+
+def test_a_bug_in_one_item_fails_its_part_and_keeps_the_others(run, tmp_path):
+    with pytest.raises(UserError, match="n003") as caught:
+        run(numbers={"fail": ["n003"]})
+    assert "RuntimeError: a bug" in str(caught.value)
+    (draft,) = Store(tmp_path / "store").drafts()
+    assert len(list((draft / "markers").iterdir())) == 3  # of 4 parts
+    _, lines = run()
+    assert "6 of them already there" in " ".join(lines)
+
+
+def test_killed_runs_end_with_the_digests_of_an_undisturbed_one(run, tmp_path):
+    config = {
+        "system": "tests.pipeline.toy", "stage": "total", "store": str(tmp_path / "killed"), "workers": 2,
+        "numbers": {"n": 24, "pause_s": 0.05}, "squares": {}, "total": {},
+    }  # fmt: skip
+    command = [sys.executable, "-m", "tests.pipeline.toy_main", json.dumps(config)]
+    delays = random.Random(7)
+    for _ in range(6):
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(delays.uniform(0.4, 1.4))
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    undisturbed, _ = run(numbers={"n": 24})
+    store = Store(tmp_path / "killed")
+    assert {a.stage: a.digest for a in store.artifacts()} == contents(undisturbed)
+    assert not store.drafts()
+    assert not [problem for artifact in store.artifacts() for problem in artifact.verify(deep=True)]
+
+
+# -- the store
+
+
+def test_verify_deep_finds_planted_corruption(run):
+    artifacts, _ = run()
+    artifact = artifacts["squares"]
+    assert artifact.verify(deep=True) == []
+    path, _ = artifact.part_of("n000")
+    data = bytearray(path.read_bytes())
+    data[600] ^= 1
+    path.write_bytes(data)
+    assert artifact.verify() == []
+    assert "does not hash" in artifact.verify(deep=True)[0]
+    path.write_bytes(data[:-512])
+    assert "bytes, not" in artifact.verify()[0]
+
+
+def test_gc_keeps_pinned_recent_and_their_inputs(run, tmp_path):
+    old, _ = run()
+    new, _ = run(squares={"offset": 1})
+    store = Store(tmp_path / "store")
+    past = time.time() - 30 * 86400
+    for artifact in store.artifacts():
+        os.utime(store.root / ".used" / artifact.key, (past, past))
+    store.pin(new["squares"].key)
+    gone = {path for path, _ in store.garbage(days=14)}
+    assert gone == {old["squares"].path, old["total"].path, new["total"].path}
+
+
+def test_resolve_takes_keys_names_and_stages(run, tmp_path):
+    artifacts, _ = run()
+    store = Store(tmp_path / "store")
+    squares = artifacts["squares"]
+    for reference in ("squares", squares.key[:8], f"squares/{squares.path.name}", str(squares.path)):
+        assert store.resolve(reference).key == squares.key
+    for reference in ("nothing", "../squares", "0000"):
+        with pytest.raises(UserError):
+            store.resolve(reference)
+
+
+def test_difference_names_the_parameter(run):
+    before, _ = run()
+    after, _ = run(squares={"offset": 1})
+    lines = commands.difference(before["squares"].manifest["preimage"], after["squares"].manifest["preimage"])
+    assert lines == ["squares.offset: 0 -> 1"]
+
+
+def test_import_rules():
+    """The engine knows no mesh, image or tensor; only stages/ imports mesh, renderer and shard libraries."""
+    import ast
+
+    forbidden = {
+        "pipeline": {"numpy", "torch", "mitsuba", "drjit", "trimesh", "pymeshlab", "webdataset", "stages", "model"},
+        "model": {"hydra", "omegaconf", "pipeline", "stages", "mitsuba", "trimesh", "pymeshlab", "webdataset"},
+        "stages": {"hydra", "omegaconf"},
+    }
+    for package, names in forbidden.items():
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_bytes())):
+                found = []
+                if isinstance(node, ast.Import):
+                    found = [alias.name for alias in node.names]
+                elif isinstance(node, ast.ImportFrom) and not node.level:
+                    found = [node.module]
+                bad = {name.split(".")[0] for name in found} & names
+                assert not bad, f"{path.relative_to(ROOT)}:{node.lineno} imports {bad}"

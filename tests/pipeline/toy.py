@@ -1,0 +1,123 @@
+"""A system of three small stages without meshes or images, for tests of the engine: numbers -> squares -> total."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from pipeline.config import StageConfig, count, runtime
+from pipeline.errors import Reject
+from pipeline.keys import seed_for
+from pipeline.stage import Item, MapStage, Record, RunStage, System
+
+
+class NumbersConfig(StageConfig):
+    n: int = count(10)
+    scale: float = 1.0
+    seed: int = 0
+    pause_s: float = runtime(0.0)
+    crash: tuple[str, ...] = runtime(())  # items that kill their worker
+    crash_once: str | None = runtime(None)  # a folder: the first item to find it without a mark dies
+    hang: tuple[str, ...] = runtime(())
+    greedy: tuple[str, ...] = runtime(())
+    fail: tuple[str, ...] = runtime(())
+
+
+class Numbers(MapStage):
+    name = "numbers"
+    version = 1
+    Config = NumbersConfig
+    reasons = {"unlucky": "thirteen"}
+
+    def part_size(self, config):
+        return 4
+
+    def items(self, config, inputs):
+        return [Item(f"n{index:03}", group="even" if index % 2 == 0 else "odd", needs=()) for index in range(config.n)]
+
+    def open(self, config, inputs, environment):
+        return config
+
+    def process(self, config, item):
+        time.sleep(config.pause_s)
+        if item.id in config.crash:
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if config.crash_once and not (Path(config.crash_once) / "mark").exists():
+            (Path(config.crash_once) / "mark").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        if item.id in config.hang:
+            while True:
+                pass
+        if item.id in config.greedy:
+            hoard = []
+            while True:
+                hoard.append(bytearray(os.urandom(1 << 20)) * 16)
+        if item.id in config.fail:
+            raise RuntimeError("a bug")
+        if item.id == "n013":
+            raise Reject("unlucky", "it is thirteen")
+        value = (seed_for(config.seed, self.name, item.id) % 1000) * config.scale
+        yield Record(item.id, {"value.txt": str(value).encode()})
+
+
+class SquaresConfig(StageConfig):
+    offset: int = 0
+    log_to: str | None = runtime(None)  # a file that gets a line per computed item
+
+
+class Squares(MapStage):
+    name = "squares"
+    version = 1
+    inputs = ("numbers",)
+    Config = SquaresConfig
+
+    def part_size(self, config):
+        return 3
+
+    def items(self, config, inputs):
+        return [Item(row.id, row.group, (("numbers", row.id),)) for row in inputs["numbers"].rows()]
+
+    def open(self, config, inputs, environment):
+        return config, inputs["numbers"]
+
+    def process(self, worker, item):
+        config, numbers = worker
+        if config.log_to:
+            with open(config.log_to, "a") as file:
+                file.write(item.id + "\n")
+        value = float(numbers.read(item.id).members["value.txt"])
+        yield Record(item.id, {"square.txt": str(value**2 + config.offset).encode()})
+
+    def finish(self, config, inputs, draft):
+        (draft.files / "card.txt").write_text(f"{len(draft.rows())} squares\n")
+        draft.note("count", len(draft.rows()))
+
+
+class TotalConfig(StageConfig):
+    steps: int = 3
+
+
+class Total(RunStage):
+    name = "total"
+    version = 1
+    inputs = ("squares",)
+    Config = TotalConfig
+    headline = "total.txt"
+
+    def run(self, config, inputs, draft):
+        squares = inputs["squares"]
+        total = sum(float(squares.read(id).members["square.txt"]) for id in squares.ids())
+        (draft.files / "total.txt").write_text(f"{total * config.steps}\n")
+        return ["total.txt"]
+
+
+SYSTEM = System(
+    "toy",
+    {
+        "numbers": "tests.pipeline.toy:Numbers",
+        "squares": "tests.pipeline.toy:Squares",
+        "total": "tests.pipeline.toy:Total",
+    },
+)
