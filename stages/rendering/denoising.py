@@ -1,0 +1,22 @@
+"""Open Image Denoise on HDR radiance with albedo and normal as guides, always on the CPU so that bytes do not depend on
+a GPU.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, coverage: np.ndarray) -> np.ndarray:
+    """(H, W, 3) float32 denoised radiance, not negative, and black where no sample of the pixel hit anything."""
+    import pyoidn
+
+    if not radiance.any():
+        return radiance
+    clean = pyoidn.denoise(
+        np.ascontiguousarray(radiance, np.float32),
+        np.ascontiguousarray(np.clip(albedo, 0, 1), np.float32),
+        np.ascontiguousarray(normal, np.float32),
+        hdr=True,
+    )
+    return np.where(coverage[..., None] > 0, np.maximum(clean, 0), 0).astype(np.float32)

@@ -1,0 +1,73 @@
+"""EXR files: what goes in comes out, in the same bytes each time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.errors import UserError
+from stages.exr import HALF_MAX, clamped_values, decode_rgb, decode_view, encode_rgb, encode_view, read_rgb, write_rgb
+from stages.records import ViewRecord
+
+
+def a_view(lights: int = 10, size: int = 6) -> ViewRecord:
+    rng = np.random.default_rng(1)
+    image = (size, size)
+    return ViewRecord(
+        rng.uniform(0, 9, (lights, *image, 3)).astype(np.float32),
+        rng.uniform(0, 9, (*image, 3)).astype(np.float32),
+        rng.uniform(0, 1, (*image, 3)).astype(np.float32),
+        rng.uniform(-1, 1, (*image, 3)).astype(np.float32),
+        rng.uniform(0, 3, image).astype(np.float32),
+        rng.uniform(0, 1, image).astype(np.float32),
+        {"index": 2, "status": "ok"},
+    )
+
+
+@pytest.mark.parametrize("lights", [0, 1, 10])
+def test_view_survives_as_half_floats(lights):
+    view = a_view(lights)
+    back = decode_view(encode_view(view))
+    for name in ("lights", "direct", "albedo", "normal", "depth", "coverage"):
+        expected = getattr(view, name).astype(np.float16).astype(np.float32)
+        assert getattr(back, name).dtype == np.float32
+        assert np.array_equal(getattr(back, name), expected), name
+    assert back.meta == view.meta
+
+
+def test_same_view_gives_the_same_bytes():
+    assert encode_view(a_view()) == encode_view(a_view())
+
+
+def test_values_beyond_half_floats_are_clamped_and_counted():
+    view = a_view(2)
+    view.lights[0, 0, 0] = 1e6
+    assert clamped_values(view) == 3
+    assert decode_view(encode_view(view)).lights.max() == HALF_MAX
+
+
+def test_rgb_image_is_exact(tmp_path):
+    image = np.random.default_rng(0).uniform(0, 1e5, (5, 7, 3)).astype(np.float32)
+    write_rgb(tmp_path / "a.exr", image)
+    assert np.array_equal(read_rgb(tmp_path / "a.exr"), image)
+    assert np.array_equal(decode_rgb(encode_rgb(image, np.float32)), image)
+    half = np.minimum(image, HALF_MAX).astype(np.float16).astype(np.float32)
+    assert np.array_equal(decode_rgb(encode_rgb(image)), half)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_a_view_reads_as_the_sum_of_its_lights():
+    view = a_view()
+    assert np.allclose(decode_rgb(encode_view(view)), view.image, rtol=2e-3)
+
+
+def test_what_is_no_image_is_refused_by_name(tmp_path):
+    (tmp_path / "bad.exr").write_bytes(b"nothing of the kind")
+    with pytest.raises(UserError, match="bad.exr is not an OpenEXR image"):
+        read_rgb(tmp_path / "bad.exr")
+    with pytest.raises(UserError, match="missing.exr cannot be read"):
+        read_rgb(tmp_path / "missing.exr")
+    with pytest.raises(UserError, match="not a view"):
+        decode_view(encode_rgb(np.zeros((2, 2, 3))), "that")
+    with pytest.raises(UserError, match="existing folder"):
+        write_rgb(tmp_path / "no" / "a.exr", np.zeros((2, 2, 3)))
