@@ -1,0 +1,1 @@
+"""What *evaluate* is made of: baselines, statistics over scenes, the HTML report."""

@@ -1,0 +1,225 @@
+"""evaluate: how well the model renders scenes that it has never seen, against baselines that deserve the name.
+
+Reads *shard* (held-out scenes with their path-traced views; training views for the mean image) and *train* (checkpoint,
+loss log). Writes one record per scene, ``metrics.json`` (every metric of every method and view) and one half-float EXR
+per view with the prediction, and ``files/``: report.html, metrics.json, metrics.md.
+
+One design choice: a record holds all that the report says about its scene, so that the report is only statistics and
+pictures. Paper: section 4.1, table 1.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field
+
+from pipeline.config import StageConfig, runtime
+from pipeline.errors import UserError
+from pipeline.stage import Inputs, Item, MapStage, Record
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+
+    from pipeline.store import Artifact, Draft
+
+
+class EvaluateConfig(StageConfig):
+    split: Literal["test", "validation", "train"] = "test"
+    baseline_views: int = Field(1024, ge=1)  # a mean of 1,024 is within 0.005 dB of the mean of all, in bounded memory
+    gallery: int = Field(24, ge=0)  # views shown in the report
+    lpips: Literal["none", "vgg", "alex"] = "none"
+    lpips_folder: str | None = runtime(None)  # where its weights lie; which they are is known from the network's name
+    device: Literal["auto", "cpu", "cuda"] = runtime("auto")
+
+
+@dataclass
+class Worker:
+    config: EvaluateConfig
+    device: str
+    model: Any
+    shard: Artifact
+    metrics: dict[str, Any]
+    mean_images: dict[str, np.ndarray]  # per space, (H, W, 3)
+
+
+class Evaluate(MapStage):
+    name = "evaluate"
+    headline = "report.html"
+    version = 1
+    inputs = ("shard", "train")
+    Config = EvaluateConfig
+
+    def slug(self, config: EvaluateConfig) -> str:
+        return config.split
+
+    def part_size(self, config: EvaluateConfig) -> int:
+        return 4
+
+    def environment(self, config: EvaluateConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
+        """The device, one for the whole artifact: another rounds otherwise."""
+        import torch
+
+        cuda = torch.cuda.is_available()
+        wanted = previous["device"] if previous else config.device
+        if wanted == "cuda" and not cuda:
+            begun = "this evaluation was begun with it; use that machine, or give another split" if previous else ""
+            raise UserError(f"evaluate.device=cuda: PyTorch finds no CUDA device here; {begun or 'use auto or cpu'}")
+        return {"device": ("cuda" if cuda else "cpu") if wanted == "auto" else wanted}
+
+    def max_workers(self, config: EvaluateConfig, environment: dict[str, Any]) -> int | None:
+        return 1 if environment["device"] == "cuda" else None
+
+    def items(self, config: EvaluateConfig, inputs: Inputs) -> Iterator[Item]:
+        shard = inputs["shard"]
+        if not shard.ids(config.split):
+            raise UserError(f"evaluate.split={config.split}: the shards hold no such scene, only {', '.join(shard.groups())}")
+        for scene_id in shard.ids(config.split):
+            yield Item(scene_id, config.split)
+
+    def open(self, config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any]) -> Worker:
+        import torch
+
+        from stages.evaluation.baselines import mean_images
+        from stages.metrics import with_lpips
+        from stages.predict import load_model
+
+        # Sums in another order round differently: one thread, so that a record is the same for any number of workers.
+        torch.set_num_threads(1)
+        return Worker(
+            config=config,
+            device=environment["device"],
+            model=load_model(inputs["train"].file("checkpoint")),
+            shard=inputs["shard"],
+            metrics=with_lpips(config.lpips, config.lpips_folder),
+            mean_images=mean_images(training_images(inputs["shard"], config.baseline_views), config.baseline_views),
+        )
+
+    def process(self, worker: Worker, item: Item) -> Iterator[Record]:
+        import numpy as np
+
+        from stages.arrays import pack_json
+        from stages.dataset import decode_sample
+        from stages.evaluation.baselines import best_constants, measure_baseline
+        from stages.exr import encode_rgb
+        from stages.metrics import measure_all
+        from stages.predict import predict_scene
+
+        sample = decode_sample(worker.shard.read(item.id))
+        scene, cameras = sample.scene, list(sample.views)
+        targets = np.stack([view.image for view in sample.views.values()])
+        predictions = predict_scene(worker.model, scene, cameras, targets.shape[1], worker.device)
+        if not np.isfinite(predictions).all():
+            raise UserError(f"the model's prediction of scene {item.id} holds NaN or infinity: training has diverged")
+        mean_image = measure_baseline(targets, worker.mean_images, worker.metrics)
+        constant = measure_baseline(targets, best_constants(targets), worker.metrics)
+        members, rows = {}, []
+        for number, (camera, target, prediction) in enumerate(zip(cameras, targets, predictions, strict=True)):
+            scores = {
+                "model": measure_all(target, prediction, worker.metrics),
+                "mean_image": mean_image[number],
+                "constant": constant[number],
+                "direct": measure_all(target, sample.views[camera].direct, worker.metrics),
+            }
+            rows.append({"index": camera, "scores": scores})
+            members[f"view{camera}.prediction.exr"] = encode_rgb(prediction)
+        facts = {
+            "id": item.id,
+            "template": scene.meta["template"],
+            "lights": scene.n_lights,
+            "triangles": len(scene.triangles),
+            "resolution": targets.shape[1],
+        }
+        yield Record(item.id, {"metrics.json": pack_json({**facts, "views": rows}), **members})
+
+    def finish(self, config: EvaluateConfig, inputs: Inputs, draft: Draft) -> None:
+        from stages.arrays import unpack_json
+        from stages.dataset import decode_sample
+        from stages.evaluation.report import write_report
+        from stages.evaluation.statistics import summarise
+        from stages.exr import decode_rgb
+        from stages.metrics import with_lpips
+
+        shard, train = inputs["shard"], inputs["train"]
+        scenes = [unpack_json(draft.read(row.id).members["metrics.json"]) for row in draft.rows()]
+        metrics = with_lpips(config.lpips, None)
+        summary = summarise(scenes, metrics)
+        log = [json.loads(line) for line in train.file("log.jsonl").read_text().splitlines() if line]
+        summary["train"] = {
+            "key": train.key,
+            "steps": log[-1]["step"] if log else 0,
+            **network(train.file("checkpoint")),
+        }
+        summary["data"] = {
+            "key": shard.key,
+            "split": config.split,
+            "scenes": {g: len(shard.ids(g)) for g in shard.groups()},
+        }
+
+        def images(scene_id: str, camera: int) -> dict[str, np.ndarray]:
+            view = decode_sample(shard.read(scene_id)).views[camera]
+            prediction = decode_rgb(draft.read(scene_id).members[f"view{camera}.prediction.exr"])
+            return {"target": view.image, "prediction": prediction, "direct": view.direct}
+
+        configs = {name: inputs[name].manifest["preimage"]["params"] for name in ("train", "shard")}
+        configs["evaluate"] = config.model_dump(mode="json")
+        facts = report_facts(summary, scenes[0]["resolution"], draft.key)
+        write_report(draft.files, summary, config.split, facts, configs, log, images, config.gallery, metrics)
+        means = {
+            method: {name: round(v["mean"], metrics[name].digits) for name, v in row.items()}
+            for method, row in summary["methods"].items()
+        }
+        draft.note("metrics", {"beats_baselines": summary["beats_baselines"], **means})
+        for name in ("psnr", "log_error"):
+            values = ", ".join(f"{method} {metrics[name].format(row[name])}" for method, row in means.items())
+            draft.log(f"{metrics[name].heading}: {values}")
+
+    def check(self, draft: Draft) -> None:
+        assert (draft.files / "report.html").is_file(), "evaluate wrote no report"
+
+
+def training_images(shard: Artifact, views: int) -> Iterator[np.ndarray]:
+    """(V, H, W, 3) linear radiance, scene by scene, evenly strided over the training split: about ``views`` images."""
+    import numpy as np
+
+    from stages.dataset import decode_sample
+
+    ids = shard.ids("train")
+    if not ids:
+        raise UserError("evaluate: the shards hold no training scene, so there is no mean training image to compare with")
+    stride = math.ceil(len(ids) * len(decode_sample(shard.read(ids[0])).views) / views)
+    for scene_id in ids[::stride]:
+        yield np.stack([view.image for view in decode_sample(shard.read(scene_id)).views.values()])
+
+
+def network(checkpoint: Path) -> dict[str, int]:
+    """Size of the network in a released-format checkpoint folder, from its headers alone."""
+    from safetensors import safe_open
+
+    config = json.loads((checkpoint / "config.json").read_text())
+    with safe_open(checkpoint / "model.safetensors", framework="numpy") as file:
+        parameters = sum(math.prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118 - not a dict
+    names = {"width": "latent_dim", "layers": "num_layers", "view_layers": "view_transformer_n_layers"}
+    return {"parameters": parameters, **{ours: config[theirs] for ours, theirs in names.items()}}
+
+
+def report_facts(summary: dict[str, Any], resolution: int, key: str) -> dict[str, str]:
+    """What the report says about itself: label -> text."""
+    train, data = summary["train"], summary["data"]
+    counts = ", ".join(
+        f"{data['scenes'][split]:,} {split}" for split in ("train", "validation", "test") if split in data["scenes"]
+    )
+    return {
+        "model": f"{train['layers']} + {train['view_layers']} layers, width {train['width']}, "
+        f"{train['parameters']:,} parameters, {train['steps']:,} training steps",
+        "data": f"{counts} scenes at {resolution}×{resolution} pixels; evaluated here: {data['split']}",
+        "train artifact": train["key"][:12],
+        "shard artifact": data["key"][:12],
+        "this artifact": key[:12],
+    }
