@@ -1,0 +1,22 @@
+"""Geometry: what *collect*, *remesh* and *decimate* compute.
+
+``load``        a mesh file of any supported format as checked arrays, or a Reject
+``procedural``  families of made-up shapes
+``catalogue``   ids, splits, duplicates: what is decided over all objects
+``measure``     areas, volumes, manifoldness, distances, visibility
+``remesher``    unsigned distance, flood fill from outside, marching cubes, pull-back
+``decimator``   quadric edge collapse to a ladder of budgets
+``sheet``       contact sheets
+
+Meshes are (V, 3) float64 vertices and (F, 3) int64 faces inside this package, float32 and int32 in records.
+"""
+
+from __future__ import annotations
+
+import os
+
+
+def one_thread() -> None:
+    """Keep native libraries to one thread in this process: workers are the parallelism. Call before importing them."""
+    for name in ("OMP_NUM_THREADS", "IGL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")

@@ -1,0 +1,369 @@
+"""A mesh file as checked arrays: everything that a stranger's file can get wrong is settled here, before native code
+runs.
+
+Reads one file and, for glTF, the buffers beside it, never anything outside the given root. trimesh parses; what it
+would follow or allocate on a file's word alone (materials, images, URIs, stated counts, node graphs) is checked or
+removed first.
+"""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import io
+import json
+import logging
+import re
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from pipeline.errors import Reject
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")  # what is looked for in a folder
+BUFFER_SUFFIX = ".bin"  # files that a glTF may keep its buffers in
+DRACO = "KHR_draco_mesh_compression"
+# Extensions that a file may require and that change nothing about where its triangles are, or that the loader decodes.
+HARMLESS = {DRACO, "KHR_mesh_quantization"}
+HARMLESS_PREFIXES = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_animation_", "KHR_xmp")
+EXTENT_RANGE = (1e-12, 1e12)  # longest side of a sane bounding box, in the file's own units
+
+logging.getLogger("trimesh").setLevel(logging.ERROR)
+
+
+@dataclass
+class Loaded:
+    """vertices (V, 3) float64 and faces (F, 3) int64 in the file's units and axes; scene graph flattened, parts
+    concatenated."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    parts: int = 1
+    about: dict[str, str] = field(default_factory=dict)  # origin and licence where the file states them
+
+
+def load_mesh(path: Path, root: Path, max_bytes: int, max_faces: int) -> Loaded:
+    """The checked mesh of a file inside ``root``; raises Reject with a reason of *collect*."""
+    path, root = Path(path), Path(root)
+    if not inside(path, root):
+        raise Reject("unsafe_path", f"{path.name} leads outside the folder")
+    if not path.is_file():
+        raise Reject("unreadable", f"{path.name} is not a regular file")
+    size = path.stat().st_size
+    if size > max_bytes:
+        raise Reject("too_large", f"{size} bytes, at most {max_bytes} are read")
+    data = path.read_bytes()
+    kind = path.suffix.lower()
+    about: dict[str, str] = {}
+    try:
+        if kind in (".gltf", ".glb"):
+            data, about = _prepare_gltf(data, kind, path.parent, root, max_bytes, max_faces)
+            kind = ".glb"
+        elif kind == ".obj":
+            _check_obj(data, path.parent, root)
+        else:
+            _check_counts(data, kind, max_faces)
+        vertices, faces, parts = _parse(data, kind)
+    except Reject:
+        raise
+    except MemoryError:
+        raise
+    except Exception as error:  # parsers of strangers' files fail in every way: all of them mean "unreadable"
+        raise Reject("unreadable", f"{type(error).__name__}: {str(error)[:200]}") from None
+    vertices, faces = checked(vertices, faces, max_faces)
+    return Loaded(vertices, faces, parts, about)
+
+
+def inside(path: Path, root: Path) -> bool:
+    """Whether ``path``, with every link followed, lies in ``root``."""
+    return path.resolve().is_relative_to(root.resolve())
+
+
+def checked(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh without unused vertices and zero-area triangles, or a Reject: safe for native code afterwards."""
+    if len(faces) == 0 or len(vertices) == 0:
+        raise Reject("no_faces", f"{len(vertices)} vertices, {len(faces)} faces")
+    if len(faces) > max_faces:
+        raise Reject("too_large", f"{len(faces)} faces, at most {max_faces} are taken")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise Reject("bad_indices", f"indices {faces.min()}..{faces.max()} for {len(vertices)} vertices")
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices, faces = vertices[used], faces.reshape(-1, 3)
+    if not np.isfinite(vertices).all():
+        raise Reject("not_finite", f"{int((~np.isfinite(vertices)).any(axis=1).sum())} vertices")
+    if np.abs(vertices).max() > EXTENT_RANGE[1]:
+        raise Reject("degenerate", f"coordinates up to {np.abs(vertices).max():.3g}")
+    extent = float(np.ptp(vertices, axis=0).max())
+    if extent < EXTENT_RANGE[0] or extent < 1e-6 * np.abs(vertices).max():
+        raise Reject("degenerate", f"longest side {extent:.3g}")
+    corners = (vertices / extent)[faces]
+    double_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    solid = double_area > 1e-14
+    if double_area.sum() < 1e-8:
+        raise Reject("degenerate", f"area {double_area.sum() / 2:.3g} of the squared longest side")
+    used, faces = np.unique(faces[solid], return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3)
+
+
+def normalise(vertices: np.ndarray) -> np.ndarray:
+    """Bounding box centred on the origin, longest side 1; computed in float64, rounded once to float32."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    return ((vertices - (low + high) / 2) / (high - low).max()).astype(np.float32)
+
+
+def buffer_files(path: Path) -> list[str]:
+    """URIs of the side files that a ``.gltf`` names, as written; [] where it cannot be read."""
+    try:
+        tree = json.loads(path.read_bytes())
+        return [b["uri"] for b in tree.get("buffers", []) if not b.get("uri", "data:").startswith("data:")]
+    except (OSError, ValueError, AttributeError, TypeError):
+        return []
+
+
+# -- parsing
+
+
+def _parse(data: bytes, kind: str) -> tuple[np.ndarray, np.ndarray, int]:
+    """(vertices, faces, parts) by trimesh, from memory: no resolver, so nothing else can be opened."""
+    import trimesh
+
+    options: dict[str, Any] = {"skip_materials": True} if kind == ".obj" else {}
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind[1:], process=False, resolver=_Nothing(), **options)
+    vertices, faces, start, parts = [], [], 0, 0
+    for name in sorted(scene.graph.nodes_geometry):
+        transform, geometry = scene.graph[name]
+        mesh = scene.geometry[geometry]
+        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+            continue
+        points, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        if triangles.min() < 0 or triangles.max() >= len(points):  # before parts are joined, where it would hide
+            raise Reject("bad_indices", f"indices {triangles.min()}..{triangles.max()} for {len(points)} vertices")
+        transform = np.asarray(transform, np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):
+            points = points @ transform[:3, :3].T + transform[:3, 3]
+        if np.linalg.det(transform[:3, :3]) < 0:  # a mirrored node turns its faces inside out
+            triangles = triangles[:, ::-1]
+        vertices.append(points)
+        faces.append(triangles + start)
+        start += len(points)
+        parts += 1
+    if not parts:
+        raise Reject("no_faces", "no part of it has a triangle")
+    return np.concatenate(vertices), np.concatenate(faces), parts
+
+
+class _Nothing:
+    """A resolver that has no file: what trimesh asks for here is never geometry."""
+
+    def get(self, name: str) -> bytes:
+        raise FileNotFoundError(name)
+
+    __getitem__ = get
+
+    def keys(self) -> list[str]:
+        return []
+
+    def namespaced(self, namespace: str) -> _Nothing:
+        return self
+
+
+def check_path(uri: str, folder: Path, root: Path) -> Path:
+    """The file inside ``root`` that a reference means, or a Reject."""
+    name = unquote(uri).replace("\\", "/")
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", name) or PurePosixPath(name).is_absolute() or "\0" in name:
+        raise Reject("unsafe_path", f"refers to {uri[:80]!r}")
+    target = folder / name
+    if not inside(target, root):
+        raise Reject("unsafe_path", f"refers to {uri[:80]!r}")
+    return target
+
+
+def _check_obj(data: bytes, folder: Path, root: Path) -> None:
+    """An OBJ's faces need nothing else, but a material library outside its folder is a file not to trust."""
+    for line in re.findall(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", data, flags=re.MULTILINE):
+        check_path(line.decode("utf-8", "replace"), folder, root)
+    # trimesh takes an index past the end without a word in some layouts: count for ourselves
+    count = len(re.findall(rb"^[ \t]*v[ \t]", data, flags=re.MULTILINE))
+    highest = 0
+    for line in re.findall(rb"^[ \t]*f[ \t]+(.+)$", data, flags=re.MULTILINE):
+        for word in line.split():
+            head = word.split(b"/", 1)[0]
+            if head.lstrip(b"-").isdigit():
+                highest = max(highest, abs(int(head)))
+    if highest > count:
+        raise Reject("bad_indices", f"a face names vertex {highest} of {count}")
+
+
+def _check_counts(data: bytes, kind: str, max_faces: int) -> None:
+    """Counts that a PLY, OFF or binary STL states must fit its bytes and the limits, before a parser allocates them."""
+    stated: list[tuple[str, int, int]] = []  # what, how many, fewest bytes each
+    if kind == ".ply":
+        header = data[: data.find(b"end_header") + 1] if b"end_header" in data[:65536] else b""
+        if not header:
+            raise Reject("unreadable", "no PLY header")
+        for name, number in re.findall(rb"^element[ \t]+(\w+)[ \t]+(\d+)", header, flags=re.MULTILINE):
+            stated.append((name.decode(), int(number), 2))
+    elif kind == ".off":
+        text = re.sub(rb"#[^\n]*", b"", data[:65536])
+        numbers = re.match(rb"\s*(?:[A-Z4n]*OFF\b)?\s*(\d+)\s+(\d+)", text)
+        if not numbers:
+            raise Reject("unreadable", "no OFF header")
+        stated += [("vertex", int(numbers[1]), 6), ("face", int(numbers[2]), 4)]
+    elif kind == ".stl" and not data[:512].lstrip().lower().startswith(b"solid") and len(data) >= 84:
+        stated.append(("face", struct.unpack_from("<I", data, 80)[0], 50))
+    for name, number, least in stated:
+        if number * least > len(data):
+            raise Reject("unreadable", f"states {number} elements {name!r} in {len(data)} bytes")
+        if name == "face" and number > max_faces:
+            raise Reject("too_large", f"states {number} faces, at most {max_faces} are taken")
+
+
+# -- glTF
+
+
+def _prepare_gltf(
+    data: bytes, kind: str, folder: Path, root: Path, max_bytes: int, max_faces: int
+) -> tuple[bytes, dict[str, str]]:
+    """A self-contained GLB with the same triangles and nothing else: no materials, images, skins, cameras or outer
+    files."""
+    binary = b""
+    if kind == ".glb":
+        tree, binary = _split_glb(data)
+    else:
+        tree = json.loads(data)
+    if not isinstance(tree, dict) or not str(tree.get("asset", {}).get("version", "2")).startswith("2"):
+        raise Reject("unsupported", "not glTF 2.x")
+    required = set(tree.get("extensionsRequired", []))
+    unknown = sorted(e for e in required - HARMLESS if not e.startswith(HARMLESS_PREFIXES))
+    if unknown:
+        raise Reject("unsupported", f"requires {', '.join(unknown)}")
+    _check_graph(tree, max_faces)
+    if _uses_draco(tree) and importlib.util.find_spec("DracoPy") is None:
+        raise Reject("needs_draco", "requires Draco compression: install the package DracoPy")
+    joined, offsets = bytearray(), []
+    for index, buffer in enumerate(tree.get("buffers", [])):
+        offsets.append(len(joined))
+        joined += _buffer(buffer, index, binary, folder, root, max_bytes)
+        joined += b"\0" * (-len(joined) % 4)
+        if len(joined) > max_bytes:
+            raise Reject("too_large", f"buffers of over {max_bytes} bytes")
+    for view in tree.get("bufferViews", []):
+        start = view.get("byteOffset", 0)
+        if min(start, view["byteLength"], view["buffer"]) < 0:
+            raise Reject("unreadable", "a buffer view with negative numbers")
+        end = offsets[view["buffer"] + 1] if view["buffer"] + 1 < len(offsets) else len(joined)
+        view["byteOffset"] = start + offsets[view["buffer"]]
+        if view["byteOffset"] + view["byteLength"] > end:
+            raise Reject("unreadable", "a buffer view past the end of its buffer")
+        view["buffer"] = 0
+    for name in ("materials", "textures", "images", "samplers", "skins", "cameras", "animations", "extensions"):
+        tree.pop(name, None)
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            primitive.pop("material", None)
+            primitive.pop("targets", None)
+            # positions only: a colour or texture coordinate cannot make a mesh fail
+            primitive["attributes"] = {k: v for k, v in primitive["attributes"].items() if k == "POSITION"}
+            extensions = primitive.get("extensions", {})
+            primitive["extensions"] = {k: v for k, v in extensions.items() if k == DRACO}
+    for node in tree.get("nodes", []):
+        for name in ("skin", "camera", "extensions"):
+            node.pop(name, None)
+    tree["buffers"] = [{"byteLength": len(joined)}]
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(joined), 0x004E4942) + joined
+    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks, _gltf_about(tree)
+
+
+def _split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """(JSON, binary chunk) of a GLB."""
+    magic, version, _ = struct.unpack_from("<III", data)
+    if magic != 0x46546C67:
+        raise Reject("unreadable", "no GLB header")
+    if version != 2:
+        raise Reject("unsupported", f"GLB version {version}")
+    chunks: dict[int, bytes] = {}
+    at = 12
+    while at + 8 <= len(data):
+        length, kind = struct.unpack_from("<II", data, at)
+        if at + 8 + length > len(data):
+            raise Reject("unreadable", "a chunk past the end of the file")
+        chunks.setdefault(kind, data[at + 8 : at + 8 + length])
+        at += 8 + length
+    return json.loads(chunks[0x4E4F534A]), chunks.get(0x004E4942, b"")
+
+
+def _buffer(buffer: dict[str, Any], index: int, binary: bytes, folder: Path, root: Path, max_bytes: int) -> bytes:
+    """The bytes of one buffer: the GLB's own, a data URI, or a file inside the root."""
+    uri = buffer.get("uri")
+    if uri is None:
+        if index:
+            raise Reject("unreadable", f"buffer {index} has no data")
+        data = binary
+    elif uri.startswith("data:"):
+        data = base64.b64decode(uri.partition(",")[2])
+    else:
+        target = check_path(uri, folder, root)
+        if target.suffix.lower() != BUFFER_SUFFIX:  # only these are part of the source's identity
+            raise Reject("unsupported", f"buffer file {uri[:80]!r}: only *{BUFFER_SUFFIX} is read")
+        if not target.is_file():
+            raise Reject("unreadable", f"buffer file {uri[:80]!r} is missing")
+        if target.stat().st_size > max_bytes:
+            raise Reject("too_large", f"buffer file {uri[:80]!r} has over {max_bytes} bytes")
+        data = target.read_bytes()
+    if len(data) < buffer["byteLength"]:
+        raise Reject("unreadable", f"buffer {index} states {buffer['byteLength']} bytes and has {len(data)}")
+    return data[: buffer["byteLength"]]
+
+
+def _uses_draco(tree: dict[str, Any]) -> bool:
+    """Whether any triangle of the file exists only as Draco data."""
+    return DRACO in tree.get("extensionsRequired", []) or any(
+        DRACO in primitive.get("extensions", {}) for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]
+    )
+
+
+def _check_graph(tree: dict[str, Any], max_faces: int) -> None:
+    """Nodes form a forest, as glTF demands (no cycle, no node used twice: nothing multiplies), of a sane number of
+    faces."""
+    accessors, nodes, faces = tree.get("accessors", []), tree.get("nodes", []), []
+    for mesh in tree.get("meshes", []):
+        total = 0
+        for primitive in mesh["primitives"]:
+            mode = primitive.get("mode", 4)
+            if mode in (4, 5, 6):
+                where = primitive["indices"] if "indices" in primitive else primitive["attributes"]["POSITION"]
+                number = int(accessors[where]["count"])
+                total += number // 3 if mode == 4 else max(number - 2, 0)
+        faces.append(total)
+    parent: dict[int, int] = {}
+    for index, node in enumerate(nodes):
+        for child in node.get("children", []):
+            if child in parent or not 0 <= child < len(nodes):
+                raise Reject("unreadable", f"node {child} has two parents or does not exist")
+            parent[child] = index
+    depth = {index: 0 for index in range(len(nodes)) if index not in parent}
+    queue = list(depth)
+    for index in queue:  # grows while it is walked: breadth first
+        for child in nodes[index].get("children", []):
+            depth[child] = depth[index] + 1
+            queue.append(child)
+    if len(depth) != len(nodes):
+        raise Reject("unreadable", "the nodes form a cycle")
+    total = sum(faces[node["mesh"]] for node in nodes if "mesh" in node)
+    if total > max_faces:
+        raise Reject("too_large", f"states {total} faces, at most {max_faces} are taken")
+
+
+def _gltf_about(tree: dict[str, Any]) -> dict[str, str]:
+    """Licence and origin as the common exporters write them: asset.copyright, and asset.extras of Sketchfab."""
+    asset = tree.get("asset", {})
+    extras = asset.get("extras", {}) if isinstance(asset.get("extras"), dict) else {}
+    licence = extras.get("license") or asset.get("copyright") or ""
+    origin = extras.get("source") or ""
+    return {name: str(value)[:300] for name, value in (("licence", licence), ("origin", origin)) if value}
