@@ -32,11 +32,11 @@ def count(default: Any = ..., **kwargs: Any) -> Any:
 class Section(BaseModel):
     """Base of every config model: frozen, no unknown fields, no NaN."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, protected_namespaces=())
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, protected_namespaces=())
 
 
 class Limits(Section):
-    """What one item may use before its worker is killed and the item rejected (after one retry alone)."""
+    """What one item may use before its worker is killed and the item, after one retry alone, rejected."""
 
     cpu_s: float = 600.0  # CPU seconds
     wall_s: float = 1800.0  # seconds on the clock, for what hangs without computing
@@ -47,7 +47,7 @@ class StageConfig(Section):
     """Base of every stage's config."""
 
     workers: int | None = runtime(None, ge=1)  # worker processes of this stage; None: the run's
-    limits: Limits = runtime(Limits())
+    limits: dict[str, float] = runtime({})  # cpu_s, wall_s, memory_gb of one item; what is not given: the stage's own
     max_reject_share: float = runtime(0.5, ge=0, le=1)  # above this share of rejected items the stage fails
 
 

@@ -18,7 +18,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field
 
 from pipeline.code import code_digest, commit
-from pipeline.config import Section, StageConfig, nearest, parse
+from pipeline.config import Limits, Section, StageConfig, nearest, parse
 from pipeline.errors import UserError
 from pipeline.executor import KILLED_REASONS, run_parts
 from pipeline.keys import SCHEME, canonical, digest_of
@@ -328,6 +328,7 @@ def _run_map(
         failed.extend(result.failed)
         progress.add(fresh[result.part_key] if not result.failed else 0, result.rejects)
 
+    limits = parse(Limits, {**stage.limits, **config.limits}, f"{planned.name}.limits")
     workers = config.workers if config.workers is not None else run.workers
     cores = os.cpu_count() or 1
     workers = cores if workers == "auto" else workers
@@ -336,7 +337,7 @@ def _run_map(
     workers = min(workers, len(tasks)) if workers else 0
     if tasks:
         try:
-            run_parts(tasks, workers, max(1, cores // max(workers, 1)), config.limits, on_result, progress.log)
+            run_parts(tasks, workers, max(1, cores // max(workers, 1)), limits, on_result, progress.log)
         finally:
             progress.close()
     if failed:

@@ -88,6 +88,8 @@ class Stage:
 class MapStage(Stage):
     """Items in, records out, in parts."""
 
+    limits: ClassVar[Mapping[str, float]] = {}  # of one item, where they differ from pipeline.config.Limits
+
     def part_size(self, config: StageConfig) -> int:
         """Items per part. Independent of the number of workers."""
         return 16

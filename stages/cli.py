@@ -21,8 +21,7 @@ PROGRAM = "lightmill"
 def command_run(arguments: argparse.Namespace) -> int:
     from pipeline.__main__ import main as run_main
 
-    words = list(arguments.words)
-    return run_main([*words, "--debug"] if arguments.debug else words)
+    return run_main([*arguments.words, *(["--debug"] if arguments.debug else [])])
 
 
 def command_trace(arguments: argparse.Namespace) -> int:
@@ -102,7 +101,7 @@ def build_parser() -> argparse.ArgumentParser:
         return sub
 
     sub = add("run", command_run, "run stages (the same as python -m pipeline)", "stage=shard scene.count.train=200")
-    sub.add_argument("words", nargs=argparse.REMAINDER, help="overrides, -m for a sweep")
+    sub.usage = f"{PROGRAM} run [stage=STAGE] [name=value ...] [-m] [--debug]"
     add_commands(parsers, PROGRAM)
 
     sub = add("trace", command_trace, "path trace a scene given as released JSON or HDF5", "scene.json -o out.exr --spp 256")
@@ -137,7 +136,11 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Returns the exit status: 0, 1 for what a check found, 2 for an error that the user can mend."""
-    arguments = build_parser().parse_args(words)
+    arguments, unknown = build_parser().parse_known_args(words)
+    if arguments.function is command_run:
+        arguments.words = unknown  # overrides and Hydra's own flags, in any order
+    elif unknown:
+        build_parser().error(f"unknown arguments: {' '.join(unknown)}; see {PROGRAM} COMMAND --help")
     try:
         return arguments.function(arguments)
     except (ValueError, OSError) as error:

@@ -2,7 +2,7 @@
 
 Reads *shard* (held-out scenes with their path-traced views; training views for the mean image) and *train* (checkpoint,
 loss log). Writes one record per scene, ``metrics.json`` (every metric of every method and view) and one half-float EXR
-per view with the prediction, and ``files/``: report.html, metrics.json, metrics.md.
+per view with the prediction, and ``files/``: report.html, metrics.json, metrics.md, overview.png.
 
 One design choice: a record holds all that the report says about its scene, so that the report is only statistics and
 pictures. Paper: section 4.1, table 1.

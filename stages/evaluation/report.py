@@ -20,6 +20,8 @@ from stages.metrics import METRICS, Metric, flip_map
 from stages.tonemap import exposure_for, srgb_encode, to_picture
 
 DIFFERENCE_GAIN = 5
+OVERVIEW_VIEWS = 10  # columns of overview.png
+OVERVIEW_VIEW_PIXELS = 128  # least width of a column
 INK = "#808890"  # reads on white and on black
 
 Images = Mapping[str, np.ndarray]  # target, prediction, direct: (H, W, 3) linear radiance
@@ -50,6 +52,15 @@ def view_pictures(images: Images) -> tuple[list[tuple[str, str]], float]:
         "direct light only": to_picture(direct, exposure),
     }
     return [(caption, picture_uri(pixels)) for caption, pixels in pictures.items()], exposure
+
+
+def overview(images: Sequence[Images], enlarge: int) -> np.ndarray:
+    """One picture of many views, worst first: (2 H, n W, 3) uint8, targets above predictions, each pixel ``enlarge`` wide."""
+    columns = []
+    for view in images:
+        exposure = exposure_for(view["target"])
+        columns.append(np.concatenate([to_picture(view[name], exposure) for name in ("target", "prediction")]))
+    return np.concatenate(columns, axis=1).repeat(enlarge, axis=0).repeat(enlarge, axis=1)
 
 
 def loss_curve(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -159,7 +170,7 @@ def write_report(
     gallery: int,
     metrics: Mapping[str, Metric] = METRICS,
 ) -> None:
-    """Write report.html, metrics.json and metrics.md into ``folder``.
+    """Write report.html, metrics.json, metrics.md and overview.png into ``folder``.
 
     facts: what was evaluated, label -> text. configs: stage -> resolved config, shown folded. log: the rows of the training
     log. images: (scene id, view index) -> its `Images`. gallery: at most so many views are shown.
@@ -188,5 +199,11 @@ def write_report(
         rows=rows,
     )
     (folder / "report.html").write_text(page, encoding="utf-8")
+    shown = [images(scene["id"], view["index"]) for _, scene, view in worst_first(summary["per_scene"], OVERVIEW_VIEWS)]
+    if shown:
+        from PIL import Image
+
+        pixels = overview(shown, max(1, OVERVIEW_VIEW_PIXELS // len(shown[0]["target"])))
+        Image.fromarray(pixels).save(folder / "overview.png", optimize=True)
     (folder / "metrics.md").write_text(markdown(summary, metrics), encoding="utf-8")
     (folder / "metrics.json").write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")

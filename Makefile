@@ -1,0 +1,65 @@
+# make data train eval    the whole line on the embedded default; any combination works
+# make test               the tests
+# Everything installs itself into .venv. All targets are phony: the store decides what is stale.
+
+PYTHON ?= python3
+# cpu or cuda: the CUDA build where an NVIDIA driver answers
+TORCH ?= $(shell nvidia-smi >/dev/null 2>&1 && echo cuda || echo cpu)
+TORCH_VERSION := 2.13.0
+TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
+ARGS ?=
+
+VENV := .venv
+RUN := $(VENV)/bin/python
+READY := $(VENV)/ready-$(TORCH)
+
+.PHONY: help setup data train eval test lint
+.NOTPARALLEL:
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make data      meshes -> shards   (stages collect remesh decimate scene render shard)"
+	@echo "make train     shards -> a trained model"
+	@echo "make eval      model and held-out shards -> an HTML report"
+	@echo "make test      the tests          (TESTS=tests/model for some of them)"
+	@echo "make lint      ruff"
+	@echo "make setup     only create $(VENV) and install what is missing"
+	@echo
+	@echo "ARGS='...' passes Hydra overrides on:  make data ARGS='collect=folder collect.path=meshes'"
+	@echo "TORCH=cpu|cuda chooses the torch build (here: $(TORCH)); PYTHON=python3.12 the interpreter"
+
+setup: $(READY)
+
+# torch first: on Linux the plain package brings gigabytes of CUDA, so the CPU index is asked before it
+$(READY): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "error: $(PYTHON) is older than 3.11: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 2; }
+	@echo "installing into $(VENV) (torch: $(TORCH)); a few minutes the first time"
+	@test -x $(RUN) || $(PYTHON) -m venv $(VENV)
+ifeq ($(TORCH),cpu)
+	@$(RUN) -m pip install -q --no-deps --retries 1 --index-url $(TORCH_CPU_INDEX) torch==$(TORCH_VERSION) 2>/dev/null || \
+		$(RUN) -m pip install -q --no-deps torch==$(TORCH_VERSION)
+else
+	@$(RUN) -m pip install -q torch==$(TORCH_VERSION)
+endif
+	@$(RUN) -m pip install -q -r requirements.lock
+	@$(RUN) -m pip install -q --no-deps --no-build-isolation -e .
+	@$(RUN) -c 'import pymeshlab' || \
+		{ echo "error: pymeshlab needs system libraries: apt-get install libgl1 libopengl0"; exit 2; }
+	@rm -f $(VENV)/ready-* && touch $@
+
+data: setup
+	@$(RUN) -m pipeline stage=shard $(ARGS)
+
+train: setup
+	@$(RUN) -m pipeline stage=train $(ARGS)
+
+eval: setup
+	@$(RUN) -m pipeline stage=evaluate $(ARGS)
+
+test: setup
+	@$(RUN) -m pytest $(TESTS)
+
+lint: setup
+	@$(RUN) -m ruff check .
+	@$(RUN) -m ruff format --check .

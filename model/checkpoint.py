@@ -1,0 +1,63 @@
+"""Released-format checkpoint folders: ``config.json`` and ``model.safetensors``, read and written strictly.
+
+What a model was trained with travels in the safetensors header's metadata, which other readers ignore.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from model.config import ModelConfig
+from model.renderformer import RenderFormer
+
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+
+
+def save(model: RenderFormer, folder: Path, trained_with: Mapping[str, str] | None = None) -> None:
+    """Write the folder; each file appears whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    state = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    metadata = {"format": "pt", **(trained_with or {})}
+    temporary = folder / (WEIGHTS + ".tmp")
+    save_file(state, temporary, metadata)
+    replace(temporary, folder / WEIGHTS)
+    temporary = folder / (CONFIG + ".tmp")
+    temporary.write_text(model.config.dumps())
+    replace(temporary, folder / CONFIG)
+
+
+def replace(temporary: Path, final: Path) -> None:
+    """Flush a finished temporary file to disk and give it its name."""
+    with temporary.open("rb") as file:
+        os.fsync(file.fileno())
+    os.replace(temporary, final)
+
+
+def load(folder: Path) -> tuple[RenderFormer, dict[str, str]]:
+    """The model, on the CPU in float32 and in eval mode, and what it says it was trained with (may be empty)."""
+    folder = Path(folder)
+    config = ModelConfig.load(folder / CONFIG)
+    path = folder / WEIGHTS
+    if not path.is_file():
+        raise ValueError(f"{path} is missing: a checkpoint folder holds {CONFIG} and {WEIGHTS}")
+    model = RenderFormer(config)
+    own = model.state_dict()
+    try:
+        with safe_open(path, framework="pt") as file:
+            names, metadata = set(file.keys()), file.metadata() or {}
+            state = {name: file.get_tensor(name) for name in sorted(names & set(own))}
+    except SafetensorError as error:
+        raise ValueError(f"{path} is not a safetensors file: {error}") from None
+    for what, which in (("unknown", names - set(own)), ("missing", set(own) - names)):
+        if which:
+            raise ValueError(f"{path}: {what} parameter {', '.join(sorted(which))} for the network of {CONFIG}")
+    for name, tensor in state.items():
+        if tensor.shape != own[name].shape:
+            raise ValueError(f"{path}: {name} has shape {tuple(tensor.shape)}, {CONFIG} asks for {tuple(own[name].shape)}")
+    model.load_state_dict(state)
+    return model.eval(), {name: value for name, value in metadata.items() if name != "format"}

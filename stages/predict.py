@@ -1,0 +1,112 @@
+"""Render scenes with a trained network: what ``lightmill predict`` and *evaluate* call.
+
+Reads a scene file or record and a released-format checkpoint folder; returns or writes linear HDR images. The scene is
+encoded once and all its views are decoded from the same tokens (section 3.1).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    from model.renderformer import RenderFormer
+    from stages.records import SceneRecord
+
+RELEASED_TRIANGLES = 4096  # most triangles of the released training data, for checkpoints that do not say (section 2)
+RAYS_AT_ONCE = 16384  # ray tokens decoded together
+
+
+def load_model(folder: Path) -> RenderFormer:
+    """The network of a released-format checkpoint folder, in eval mode on the CPU."""
+    from model import checkpoint
+
+    return checkpoint.load(folder)[0]
+
+
+def predict_scene(
+    model: RenderFormer, scene: SceneRecord, views: Sequence[int], resolution: int, device: Any = "cpu"
+) -> np.ndarray:
+    """(V, H, W, 3) float32 linear radiance of the scene's cameras ``views``, at least 0."""
+    import torch
+
+    from model.renderformer import to_radiance
+    from model.training import scene_of
+
+    arrays = {name: np.asarray(array)[None] for name, array in scene.arrays().items()}
+    arrays["mask"] = np.ones(arrays["roughness"].shape, bool)
+    model = model.to(device).eval()
+    cameras = torch.from_numpy(scene.camera_to_world[list(views)].astype(np.float32)).to(device)[None]
+    fov = torch.from_numpy(scene.fov_deg[list(views)].astype(np.float32)).to(device)[None]
+    rays = (resolution // model.config.patch_size) ** 2
+    step = max(1, RAYS_AT_ONCE // max(1, rays))
+    images = []
+    with torch.inference_mode():
+        triangles = scene_of(arrays, model, device)
+        tokens = model.encode(triangles)
+        for i in range(0, len(views), step):
+            y = model.decode(tokens, triangles, cameras[:, i : i + step], fov[:, i : i + step], resolution)
+            images.append(to_radiance(y[0]).clamp(min=0).cpu())  # the network may undershoot 0 by a thousandth
+    return torch.cat(images).numpy()
+
+
+def predict(
+    scene_path: Path, checkpoint_folder: Path, out: Path, resolution: int = 512, view: int | str = 0, device: str = "auto"
+) -> list[Path]:
+    """Render a scene file with a checkpoint; returns the images written (``OUT-0.exr``, ... for ``view="all"``).
+
+    .exr holds linear radiance, .png sRGB of radiance clamped to [0, 1].
+    """
+    from model import checkpoint
+    from stages.exr import write_rgb
+    from stages.released import load_scene
+    from stages.s06_train import choose_device
+
+    if out.suffix.lower() not in (".exr", ".png"):
+        raise UserError(f"{out}: the output must end in .exr (linear) or .png")
+    scene = load_scene(scene_path)
+    count = len(scene.fov_deg)
+    if view != "all" and not (isinstance(view, int) and 0 <= view < count):
+        raise UserError(f"view {view} of {scene_path} does not exist: it has cameras 0 to {count - 1}, or say all")
+    model, trained_with = checkpoint.load(checkpoint_folder)
+    multiple = model.config.resolution_multiple
+    if resolution < multiple or resolution % multiple:
+        raise UserError(f"resolution {resolution} must be a multiple of {multiple} pixels for this checkpoint")
+    limit = int(trained_with.get("triangles", RELEASED_TRIANGLES))
+    if len(scene.triangles) > limit:
+        print(
+            f"warning: {scene_path} has {len(scene.triangles):,} triangles, the checkpoint was trained with at most "
+            f"{limit:,}: expect worse images",
+            file=sys.stderr,
+        )
+    views = list(range(count)) if view == "all" else [int(view)]
+    images = predict_scene(model, scene, views, resolution, choose_device(device))
+    written = []
+    for index, image in zip(views, images, strict=True):
+        path = out.with_name(f"{out.stem}-{index}{out.suffix}") if view == "all" else out
+        if path.suffix.lower() == ".exr":
+            write_rgb(path, image)
+        else:
+            _write_png(path, image)
+        written.append(path)
+    return written
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    """The picture appears whole or not at all."""
+    from PIL import Image
+
+    from stages.tonemap import to_picture
+
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        Image.fromarray(to_picture(image)).save(temporary, format="png")
+        temporary.replace(path)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written ({error}): give a file in an existing folder") from error

@@ -1,0 +1,43 @@
+"""Made-up batches for tests and benchmarks of the network: random triangles whose image is a simple function of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+def batch(
+    step: int, scenes: int = 2, triangles: int = 12, views: int = 2, resolution: int = 16, padded: int = 0
+) -> dict[str, Any]:
+    """A training batch as ``model.training.fit`` reads it; a pure function of its arguments."""
+    rng = np.random.default_rng(step)
+
+    def uniform(*shape: int, low: float = 0.0, high: float = 1.0) -> np.ndarray:
+        return rng.uniform(low, high, shape).astype(np.float32)
+
+    corners = uniform(scenes, triangles, 3, 3, low=-0.5, high=0.5)
+    normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9
+    emission = np.zeros((scenes, triangles, 3), np.float32)
+    emission[:, 0] = uniform(scenes, 1, low=500, high=5000)
+    cameras = np.tile(np.eye(4, dtype=np.float32), (scenes, views, 1, 1))
+    cameras[:, :, 2, 3] = uniform(scenes, views, low=1.5, high=2.0)
+    mask = np.ones((scenes, triangles), bool)
+    if padded:
+        mask[0, -padded:] = False
+    diffuse = uniform(scenes, triangles, 3)
+    level = diffuse.mean(axis=1)[:, None, None, None] * emission[:, 0].mean(axis=-1)[:, None, None, None, None] / 1000
+    return {
+        "triangles": corners,
+        "vertex_normals": np.repeat(normals[:, :, None], 3, axis=2).astype(np.float32),
+        "diffuse": diffuse,
+        "specular": uniform(scenes, triangles, 3),
+        "roughness": uniform(scenes, triangles, low=0.01),
+        "emission": emission,
+        "mask": mask,
+        "camera_to_world": cameras,
+        "fov_deg": uniform(scenes, views, low=30, high=60),
+        "image": (level * np.ones((scenes, views, resolution, resolution, 1))).astype(np.float32),
+        "ids": [f"scene{step}_{i}" for i in range(scenes)],
+    }

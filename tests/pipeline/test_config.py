@@ -1,0 +1,96 @@
+"""The YAML and the typed configs agree, and a wrong word on the command line is answered with the right one."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from pipeline.__main__ import sweep_keys
+from pipeline.config import parse
+from pipeline.errors import UserError
+from pipeline.hydra_config import CONF, compose
+from pipeline.stage import load_system
+
+ROOT = Path(__file__).resolve().parents[2]
+SYSTEM = load_system("renderformer")
+ENGINE_FIELDS = {"workers", "limits", "max_reject_share"}  # every stage has them; YAML names them where they differ
+VARIANTS = [(stage, path.stem) for stage in SYSTEM.modules for path in sorted((CONF / stage).glob("*.yaml"))]
+NEEDED = {("collect", "folder"): ["collect.path=/tmp"], ("collect", "objaverse"): ["collect.ids=[a]"]}
+
+
+def missing(model: BaseModel, section: dict, path: str) -> list[str]:
+    found = []
+    for name in type(model).model_fields:
+        if name in ENGINE_FIELDS:
+            continue
+        if name not in section:
+            found.append(f"{path}.{name}")
+        elif isinstance(getattr(model, name), BaseModel) and isinstance(section[name], dict):
+            found += missing(getattr(model, name), section[name], f"{path}.{name}")
+    return found
+
+
+@pytest.mark.parametrize(("stage", "variant"), VARIANTS)
+def test_yaml_names_every_field_of_its_config(stage, variant):
+    root = compose([f"{stage}={variant}", *NEEDED.get((stage, variant), [])])
+    config = parse(SYSTEM.stage(stage).Config, root[stage], stage)
+    assert missing(config, root[stage], stage) == []
+
+
+@pytest.mark.parametrize("model", sorted(path.stem for path in (CONF / "model").glob("*.yaml")))
+def test_every_model_is_a_valid_config(model):
+    parse(SYSTEM.stage("train").Config, compose([f"model={model}"])["train"], "train")
+
+
+@pytest.mark.parametrize("experiment", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
+def test_every_experiment_composes(experiment):
+    root = compose([f"experiment={experiment}"])
+    for stage in SYSTEM.modules:
+        parse(SYSTEM.stage(stage).Config, root[stage], stage)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["render.sp=4"], "did you mean 'render.spp'"),
+        (["render=defalt"], "did you mean 'default'"),
+        (["model=tny"], "did you mean 'tiny'"),
+        (["stge=train"], "did you mean 'stage'"),
+        (["collect=folder", "collect.pth=x"], "did you mean 'collect.path'"),
+        (["nonsense"], "name=value"),
+    ],
+)
+def test_wrong_words_name_the_right_ones(overrides, message):
+    with pytest.raises(UserError, match=message):
+        compose(overrides)
+
+
+def test_sweep_keys_are_known_before_it_runs(tmp_path):
+    keys = sweep_keys(["stage=train", "model=tiny,small", f"store={tmp_path}"])
+    first, second = keys.values()
+    assert list(keys) == [f"stage=train model={name} store={tmp_path}" for name in ("tiny", "small")]
+    assert first["train"] != second["train"]
+    assert {name: key for name, key in first.items() if name != "train"} == {
+        name: key for name, key in second.items() if name != "train"
+    }
+
+
+@pytest.mark.parametrize("flags", [["-m"], []])
+def test_command_line_accepts_the_sweep_flag_anywhere(tmp_path, flags):
+    words = ["stage=train", "plan=true", "model=tiny,small" if flags else "model=tiny", f"store={tmp_path}", *flags]
+    command = [sys.executable, "-m", "pipeline", *words, f"hydra.sweep.dir={tmp_path}/r", f"hydra.run.dir={tmp_path}/r"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("train ") == (2 if flags else 1)
+
+
+def test_error_is_one_line_with_a_status(tmp_path):
+    command = [sys.executable, "-m", "pipeline", "render.spp=many", f"store={tmp_path}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: render.spp='many'")
+    assert len(done.stderr.splitlines()) == 1
