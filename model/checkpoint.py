@@ -5,6 +5,7 @@ What a model was trained with travels in the safetensors header's metadata, whic
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,10 +26,24 @@ def save(model: RenderFormer, folder: Path, trained_with: Mapping[str, str] | No
     metadata = {"format": "pt", **(trained_with or {})}
     temporary = folder / (WEIGHTS + ".tmp")
     save_file(state, temporary, metadata)
+    _sort_metadata(temporary)
     replace(temporary, folder / WEIGHTS)
     temporary = folder / (CONFIG + ".tmp")
     temporary.write_text(model.config.dumps())
     replace(temporary, folder / CONFIG)
+
+
+def _sort_metadata(path: Path) -> None:
+    """Put the header's metadata in sorted order: safetensors writes it in a random one, so equal models would differ."""
+    with path.open("r+b") as file:
+        size = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(size))
+        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+        data = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(size)
+        if len(data) != size:
+            raise AssertionError(f"header of {path} changed its length")
+        file.seek(8)
+        file.write(data)
 
 
 def replace(temporary: Path, final: Path) -> None:

@@ -161,9 +161,7 @@ class ModelConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """The released ``config.json``'s content."""
-        return {
-            name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()
-        }
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()}
 
     @classmethod
     def load(cls, path: Path) -> ModelConfig:

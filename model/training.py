@@ -42,6 +42,7 @@ class FitConfig:
     weight_decay: float = 0.01  # on matrices; norms, biases and tokens are left alone
     clip: float = 1.0  # largest gradient norm
     optimizer: str = "adamw"  # adamw | muon (2-D hidden weights; AdamW for the rest)
+    muon_lr: float = 0.02  # highest learning rate of Muon's weights: the size of a step in spectral norm
     lpips: float = 0.0  # weight of LPIPS(VGG)
     gradient_leak: float = 0.0  # gradient, beyond ELU's own, of pixels that come out negative: without it they can die
     # Runtime: these do not change the result
@@ -58,17 +59,17 @@ class FitConfig:
         return {name: value for name, value in dataclasses.asdict(self).items() if name not in self.RUNTIME}
 
 
-def learning_rate(config: FitConfig, step: int) -> float:
-    """Linear warm-up, then cosine, of the 0-based step."""
+def schedule(config: FitConfig, step: int) -> float:
+    """Share of the highest learning rate at the 0-based step: linear warm-up, then cosine."""
     if step < config.warmup:
-        return config.lr * (step + 1) / config.warmup
+        return (step + 1) / config.warmup
     end = config.steps if config.decay_steps is None else config.decay_steps
     progress = min(1.0, (step - config.warmup) / max(1, end - config.warmup))
-    return config.lr * (config.final_lr + (1 - config.final_lr) * 0.5 * (1 + math.cos(math.pi * progress)))
+    return config.final_lr + (1 - config.final_lr) * 0.5 * (1 + math.cos(math.pi * progress))
 
 
 def optimizers(model: nn.Module, config: FitConfig) -> list[torch.optim.Optimizer]:
-    """AdamW for all, or Muon for the transformer layers' matrices and AdamW for the rest; one learning rate for both."""
+    """AdamW for all, or Muon for the transformer layers' matrices and AdamW for the rest."""
     named = [(name, p) for name, p in model.named_parameters() if p.requires_grad]
     hidden = {name for name, p in named if p.ndim == 2 and ".layers." in name}
     if config.optimizer == "adamw":
@@ -83,11 +84,8 @@ def optimizers(model: nn.Module, config: FitConfig) -> list[torch.optim.Optimize
         torch.optim.AdamW([g for g in groups if g["params"]], lr=config.lr, betas=(0.9, 0.95))
     ]
     if hidden:
-        # Steps as long as AdamW's, so that the learning rate means the same to both.
         matrices = [p for name, p in named if name in hidden]
-        found.append(
-            torch.optim.Muon(matrices, lr=config.lr, weight_decay=config.weight_decay, adjust_lr_fn="match_rms_adamw")
-        )
+        found.append(torch.optim.Muon(matrices, lr=config.muon_lr, weight_decay=config.weight_decay))
     return found
 
 
@@ -248,10 +246,10 @@ def fit(
         began, base_seconds = time.perf_counter(), state.seconds
         interval_began, interval_scenes, interval_tokens = began, 0, 0
         for step, batch in enumerate(batches(state.step, config.steps), start=state.step):
-            lr = learning_rate(config, step)
+            share = schedule(config, step)
             for optimizer in state.optimizers:
                 for group in optimizer.param_groups:
-                    group["lr"] = lr
+                    group["lr"] = share * (config.muon_lr if isinstance(optimizer, torch.optim.Muon) else config.lr)
             y = predict(forward, model, batch, device, config.mixed_precision)
             loss = image_loss(y, torch.from_numpy(batch["image"]).to(device), lpips, config.lpips)
             loss.backward()
@@ -282,11 +280,11 @@ def fit(
                 now = time.perf_counter()
                 state.seconds, elapsed = base_seconds + now - began, now - interval_began
                 mean_loss, mean_norm = np.mean(state.window, axis=0).tolist() if state.window else (None, None)
-                row = {"step": state.step, "loss": mean_loss, "lr": lr, "grad_norm": mean_norm, "skipped": state.skipped}
-                write(row | {"seconds": round(state.seconds, 3)})
+                row = {"step": state.step, "loss": mean_loss, "lr": share * config.lr, "grad_norm": mean_norm}
+                write(row | {"skipped": state.skipped, "seconds": round(state.seconds, 3)})
                 shown = "     nan" if mean_loss is None else f"{mean_loss:8.5f}"
                 log(
-                    f"step {state.step:>{len(str(config.steps))}}/{config.steps}  loss {shown}  lr {lr:.2e}  "
+                    f"step {state.step:>{len(str(config.steps))}}/{config.steps}  loss {shown}  lr {share * config.lr:.2e}  "
                     f"grad {mean_norm or 0:7.3f}  {interval_scenes / elapsed:7.2f} scenes/s  "
                     f"{interval_tokens / elapsed:9,.0f} tokens/s  {_memory_gb(device):5.2f} GB"
                     + (f"  {state.skipped} skipped" if state.skipped else "")

@@ -51,7 +51,9 @@ def checkpoint_folder(reference: str, store: str) -> Path:
 
     artifact = Store(store).resolve(reference)
     if artifact.stage != "train":
-        raise UserError(f"{reference} is an artifact of stage {artifact.stage}: give one of stage train, or a checkpoint folder")
+        raise UserError(
+            f"{reference} is an artifact of stage {artifact.stage}: give one of stage train, or a checkpoint folder"
+        )
     return artifact.file("checkpoint")
 
 
@@ -143,14 +145,14 @@ def main(words: Sequence[str] | None = None) -> int:
         build_parser().error(f"unknown arguments: {' '.join(unknown)}; see {PROGRAM} COMMAND --help")
     try:
         return arguments.function(arguments)
+    except BrokenPipeError:  # the reader (head, less) went away
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 0
     except (ValueError, OSError) as error:
         if arguments.debug:
             raise
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return 0
     except KeyboardInterrupt:
         return 130
 

@@ -74,9 +74,7 @@ def decode_view(data: bytes, where: str = "the view") -> ViewRecord:
     count = sum(name.startswith("light") and name.endswith(".R") for name in channels)
     lights = [layer(f"light{index}", "RGB") for index in range(count)]
     shape = (0, *single["direct"].shape)
-    return ViewRecord(
-        np.stack(lights) if lights else np.zeros(shape, np.float32), **single, meta=unpack_json(header[META])
-    )
+    return ViewRecord(np.stack(lights) if lights else np.zeros(shape, np.float32), **single, meta=unpack_json(header[META]))
 
 
 def encode_rgb(image: np.ndarray, dtype: type = np.float16) -> bytes:

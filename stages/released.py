@@ -35,9 +35,7 @@ def load_scene(path: Path | str) -> SceneRecord:
     scene = loaders[path.suffix.lower()](path)
     for name, values in scene.arrays().items():
         if not np.isfinite(values).all():
-            raise UserError(
-                f"{path}: {name} holds {np.size(values) - np.isfinite(values).sum()} values that are not finite"
-            )
+            raise UserError(f"{path}: {name} holds {np.size(values) - np.isfinite(values).sum()} values that are not finite")
     return scene
 
 
@@ -51,9 +49,7 @@ def load_json(path: Path) -> SceneRecord:
     except (ValueError, OSError) as error:
         raise UserError(f"{path} is not JSON: {error}") from error
     if not isinstance(data, dict) or not isinstance(data.get("objects"), dict) or not data["objects"]:
-        raise UserError(
-            f"{path} has no objects: expected objects {{name: {{mesh_path, material, transform}}}} and cameras"
-        )
+        raise UserError(f"{path} has no objects: expected objects {{name: {{mesh_path, material, transform}}}} and cameras")
     cameras = data.get("cameras")
     if not isinstance(cameras, list) or not cameras:
         raise UserError(f"{path} has no camera: add cameras [{{position, look_at, up, fov}}]")
@@ -97,9 +93,7 @@ def load_json(path: Path) -> SceneRecord:
             columns[column].append(value)
         lights += emits
         objects.append({"name": str(name), "kind": "light" if emits else "object", "faces": count})
-    poses, fovs = zip(
-        *[_camera(camera, f"{path}: camera {index}") for index, camera in enumerate(cameras)], strict=True
-    )
+    poses, fovs = zip(*[_camera(camera, f"{path}: camera {index}") for index, camera in enumerate(cameras)], strict=True)
     arrays = {name: np.concatenate(parts).astype(SceneRecord.DTYPES[name]) for name, parts in columns.items()}
     meta = {
         "template": "released",
@@ -136,9 +130,7 @@ def _mesh(folder: Path, entry: dict[str, Any], smooth: bool, where: str) -> tupl
         raise UserError(f"{where} has no mesh_path")
     path = (folder / name).resolve()
     if not path.is_relative_to(folder.resolve()):
-        raise UserError(
-            f"{where}: mesh_path {name!r} leads out of the scene's folder; put the mesh beside the scene file"
-        )
+        raise UserError(f"{where}: mesh_path {name!r} leads out of the scene's folder; put the mesh beside the scene file")
     if not path.is_file():
         raise UserError(f"{where}: mesh file {path} does not exist")
     try:
@@ -265,8 +257,7 @@ def load_hdf5(path: Path) -> SceneRecord:
     lights = int(light_index.max(initial=-1)) + 1
     objects = [{"name": "surface", "kind": "object", "faces": int((light_index < 0).sum())}]
     objects += [
-        {"name": f"light{index}", "kind": "light", "faces": int((light_index == index).sum())}
-        for index in range(lights)
+        {"name": f"light{index}", "kind": "light", "faces": int((light_index == index).sum())} for index in range(lights)
     ]
     return SceneRecord(
         path.stem,
@@ -304,9 +295,7 @@ def _light_groups(triangles: np.ndarray, emits: np.ndarray) -> np.ndarray:
     if len(faces):
         corner = np.unique(triangles[faces].reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1)
         rows = np.repeat(np.arange(len(faces)), 3)
-        links = coo_matrix(
-            (np.ones(len(rows)), (rows, corner + len(faces))), shape=(len(faces) + corner.max() + 1,) * 2
-        )
+        links = coo_matrix((np.ones(len(rows)), (rows, corner + len(faces))), shape=(len(faces) + corner.max() + 1,) * 2)
         labels = connected_components(links, directed=False)[1][: len(faces)]
         order = {label: index for index, label in enumerate(dict.fromkeys(labels.tolist()))}
         groups[faces] = [order[label] for label in labels.tolist()]

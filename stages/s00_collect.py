@@ -103,11 +103,7 @@ class Collect(MapStage):
             if unknown or both:
                 raise UserError(
                     f"held-out families {unknown or both}: "
-                    + (
-                        f"known are {', '.join(sorted(FAMILIES))}"
-                        if unknown
-                        else "each can be held out in one split only"
-                    )
+                    + (f"known are {', '.join(sorted(FAMILIES))}" if unknown else "each can be held out in one split only")
                 )
             return [Item(f"{family}-{number:03d}") for family in FAMILIES for number in range(config.per_family)]
         if config.name == "folder":
@@ -245,9 +241,7 @@ def mesh_files(config: FolderConfig) -> list[str]:
             ):
                 found.append(relative.as_posix())
     if not found:
-        raise UserError(
-            f"collect.path={config.path!r} holds no mesh matching {config.pattern!r} ({', '.join(SUFFIXES)})"
-        )
+        raise UserError(f"collect.path={config.path!r} holds no mesh matching {config.pattern!r} ({', '.join(SUFFIXES)})")
     return sorted(found)
 
 

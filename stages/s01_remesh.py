@@ -80,9 +80,7 @@ class Remesh(MapStage):
         )
         compared = measure.Reference(source.vertices, source.faces).compare(vertices, faces)
         if compared["kept"] < config.min_kept:
-            raise Reject(
-                "lost", f"{compared['kept']:.0%} of the outer surface kept, at least {config.min_kept:.0%} needed"
-            )
+            raise Reject("lost", f"{compared['kept']:.0%} of the outer surface kept, at least {config.min_kept:.0%} needed")
         if compared["inside"] > config.max_inside:
             raise Reject("cluttered", f"{compared['inside']:.0%} hidden, at most {config.max_inside:.0%} taken")
         meta = {key: source.meta[key] for key in ("object_id", "content_hash", "family", "source", "origin", "licence")}
@@ -99,6 +97,4 @@ class Remesh(MapStage):
     def check(self, draft: Draft) -> None:
         for row in draft.rows():
             meta = MeshRecord.from_record(draft.read(row.id)).meta
-            assert meta["watertight"] and meta["volume"] > 0 and meta["faces"] > 0, (
-                f"{row.id} is not a closed outward mesh"
-            )
+            assert meta["watertight"] and meta["volume"] > 0 and meta["faces"] > 0, f"{row.id} is not a closed outward mesh"

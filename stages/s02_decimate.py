@@ -44,9 +44,7 @@ class Decimate(MapStage):
     version: ClassVar[int] = 1
     inputs: ClassVar[tuple[str, ...]] = ("collect", "remesh")
     Config: ClassVar[Any] = DecimateConfig
-    reasons: ClassVar[dict[str, str]] = {
-        "no_rung": "no budget was reached with a watertight mesh close enough to the original"
-    }
+    reasons: ClassVar[dict[str, str]] = {"no_rung": "no budget was reached with a watertight mesh close enough to the original"}
     limits: ClassVar[dict[str, float]] = {"cpu_s": 300.0, "wall_s": 900.0, "memory_gb": 6.0}
 
     def slug(self, config: DecimateConfig) -> str:
@@ -117,9 +115,7 @@ class Decimate(MapStage):
         for row in draft.rows():
             record = draft.read(row.id)
             rungs, stated = load_rungs(record), rung_faces(unpack_json(record.members["meta.json"]))
-            assert rungs and stated == {b: len(faces) for b, (_, faces) in rungs.items()}, (
-                f"{row.id}: rungs and meta differ"
-            )
+            assert rungs and stated == {b: len(faces) for b, (_, faces) in rungs.items()}, f"{row.id}: rungs and meta differ"
             for budget, (vertices, faces) in rungs.items():
                 where = f"{row.id} at {budget} faces"
                 assert len(faces) <= budget, f"{where} has {len(faces)}"

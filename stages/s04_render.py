@@ -96,9 +96,7 @@ class Render(MapStage):
         statuses = Counter(view.meta["status"] for view in views)
         if not statuses["ok"]:
             reason = next(iter(statuses)) if len(statuses) == 1 else "no_view_left"
-            raise Reject(
-                reason, ", ".join(f"{count} {status}" for status, count in sorted(statuses.items())) or "no camera"
-            )
+            raise Reject(reason, ", ".join(f"{count} {status}" for status, count in sorted(statuses.items())) or "no camera")
         members = {"meta.json": pack_json({"views": [view.meta for view in views]})}
         members |= {f"view{view.meta['index']}.exr": encode_view(view) for view in views if view.meta["status"] == "ok"}
         yield Record(item.id, members)
@@ -115,9 +113,7 @@ class Render(MapStage):
             for view in unpack_json(draft.read(row.id).members["meta.json"])["views"]:
                 statuses[view["status"]] += 1
                 clamped += view["clamped"]
-        draft.note(
-            "views", {**{status: statuses[status] for status in ("ok", "dark", "too_close")}, "clamped_values": clamped}
-        )
+        draft.note("views", {**{status: statuses[status] for status in ("ok", "dark", "too_close")}, "clamped_values": clamped})
         for group, ids in sorted(groups.items()):
             step = max(1, len(ids) // SHEET_SCENES)
             chosen = [draft.read(id) for id in ids[::step][:SHEET_SCENES]]

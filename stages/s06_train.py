@@ -62,14 +62,15 @@ class TrainConfig(StageConfig):
     seed: int = 0
     model: ModelSection = ModelSection()
     # Schedule
-    steps: int = Field(1200, ge=1)
+    steps: int = Field(950, ge=1)
     batch_scenes: int = Field(4, ge=1)
     views_per_scene: int = Field(4, ge=1)
-    lr: float = Field(1e-3, gt=0)
+    lr: float = Field(2e-3, gt=0)
     warmup: int = Field(50, ge=0)  # steps
     decay_steps: int | None = Field(None, ge=1)  # step at which the cosine ends; null: the last step
     final_lr: float = Field(0.0, ge=0, le=1)  # after the cosine, as a share of lr
-    optimizer: Literal["adamw", "muon"] = "adamw"
+    optimizer: Literal["adamw", "muon"] = "muon"
+    muon_lr: float = Field(0.02, gt=0)  # highest learning rate of Muon's weights: a step's size in spectral norm
     weight_decay: float = Field(0.01, ge=0)
     clip: float = Field(1.0, gt=0)  # largest gradient norm
     precision: Literal["mixed", "fp32"] = "mixed"  # mixed: view-independent stage in bfloat16 on a GPU; the CPU uses fp32
@@ -78,8 +79,8 @@ class TrainConfig(StageConfig):
     # Share of the gradient that pixels below 0 get besides ELU's own 1e-3: at high learning rates the output else dies
     gradient_leak: float = Field(0.1, ge=0, le=1)
     # Augmentation
-    rotate: bool = True  # turn the scene at random: the view-independent stage must not learn an orientation
-    translate_sigma: float = Field(0.25, ge=0)  # and move it; scene units
+    rotate: bool = False  # turn the scene at random: the view-independent stage must not learn an orientation
+    translate_sigma: float = Field(0.0, ge=0)  # and move it; scene units
     mirror: bool = False  # x -> -x, for half of the samples
     relight: bool = True  # reweight the lights' own images: light transport is linear
     lighting: Relight = Relight()  # what relight draws from
@@ -150,6 +151,7 @@ class Train(RunStage):
                 weight_decay=config.weight_decay,
                 clip=config.clip,
                 optimizer=config.optimizer,
+                muon_lr=config.muon_lr,
                 lpips=config.lpips,
                 gradient_leak=config.gradient_leak,
                 lpips_folder=Path(config.lpips_folder) if config.lpips_folder else None,

@@ -36,9 +36,7 @@ def trace(
     scene = load_scene(scene_path)
     count = len(scene.camera_to_world)
     if view != "all" and not 0 <= view < count:
-        raise UserError(
-            f"view={view} does not exist: {scene_path} has {count} camera(s), counted from 0; or give 'all'"
-        )
+        raise UserError(f"view={view} does not exist: {scene_path} has {count} camera(s), counted from 0; or give 'all'")
     chosen = choose(backend)
     paths = []
     for index in range(count) if view == "all" else [view]:

@@ -44,7 +44,9 @@ def test_from_nothing_to_a_report(first, folder):
     report = Path(first.strip().splitlines()[-1].partition(": ")[2])
     page = report.read_text()
     assert "<img" in page
-    assert not re.search(r"""(src|href)\s*=\s*["']?(https?:)?//""", page.replace('xlink:href="#', ""))  # opens from disk, offline
+    assert not re.search(
+        r"""(src|href)\s*=\s*["']?(https?:)?//""", page.replace('xlink:href="#', "")
+    )  # opens from disk, offline
     metrics = json.loads((report.parent / "metrics.json").read_text())
     assert metrics
 
@@ -116,7 +118,13 @@ def test_a_folder_of_meshes_is_a_source(shared_data, folder):
 
 def test_too_few_meshes_stop_the_run_and_say_how_many(folder, tmp_path):
     (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n")
-    words = ["collect=folder", f"collect.path={tmp_path}", "stage=collect", f"store={tmp_path}/s", f"hydra.run.dir={tmp_path}/r"]
+    words = [
+        "collect=folder",
+        f"collect.path={tmp_path}",
+        "stage=collect",
+        f"store={tmp_path}/s",
+        f"hydra.run.dir={tmp_path}/r",
+    ]
     done = subprocess.run([sys.executable, "-m", "pipeline", *words], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2
     assert "6" in done.stderr and len(done.stderr.splitlines()) == 1

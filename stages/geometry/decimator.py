@@ -50,9 +50,7 @@ class Gates:
             good = stated["distance"] <= self.max_distance and stated["kept"] >= self.min_kept
             if good and stated["flipped"] <= self.max_flipped:
                 return Rung(vertices, faces, stated)
-            self.last = (
-                ", ".join(f"{name} {stated[name]:.2%}" for name in ("distance", "kept", "flipped")) + f" at {budget}"
-            )
+            self.last = ", ".join(f"{name} {stated[name]:.2%}" for name in ("distance", "kept", "flipped")) + f" at {budget}"
         return None
 
 

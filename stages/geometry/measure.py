@@ -43,12 +43,7 @@ def watertight(faces: np.ndarray, n_vertices: int) -> bool:
     face."""
     start, end = faces.ravel().astype(np.int64), faces[:, [1, 2, 0]].ravel().astype(np.int64)
     forward, backward = np.sort(start * n_vertices + end), np.sort(end * n_vertices + start)
-    return (
-        len(faces) > 0
-        and not (start == end).any()
-        and not (np.diff(forward) == 0).any()
-        and (forward == backward).all()
-    )
+    return len(faces) > 0 and not (start == end).any() and not (np.diff(forward) == 0).any() and (forward == backward).all()
 
 
 def vertex_components(faces: np.ndarray, n_vertices: int) -> np.ndarray:
@@ -109,9 +104,7 @@ def sample(vertices: np.ndarray, faces: np.ndarray, number: int, seed: int = 0) 
     vectors = face_vectors(vertices, faces)
     double_areas = np.linalg.norm(vectors, axis=1)
     total = np.cumsum(double_areas)
-    chosen = np.searchsorted(total, (np.arange(number) + rng.random(number)) / number * total[-1]).clip(
-        max=len(faces) - 1
-    )
+    chosen = np.searchsorted(total, (np.arange(number) + rng.random(number)) / number * total[-1]).clip(max=len(faces) - 1)
     u, v = np.sqrt(rng.random(number)), rng.random(number)
     weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
     points = np.einsum("nc,ncd->nd", weights, corners_of(vertices, faces[chosen]))

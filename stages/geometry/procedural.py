@@ -118,9 +118,7 @@ def ring(outer: np.ndarray, inner: np.ndarray, low: float, high: float) -> Mesh:
     return quads(points[::-1], wrap_rows=True, wrap_columns=True)
 
 
-def box(
-    size: tuple[float, float, float] | np.ndarray, centre: tuple[float, float, float] | np.ndarray = (0, 0, 0)
-) -> Mesh:
+def box(size: tuple[float, float, float] | np.ndarray, centre: tuple[float, float, float] | np.ndarray = (0, 0, 0)) -> Mesh:
     """An axis-aligned box."""
     square = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
     vertices, faces = extrude(square, np.array([-0.5, 0.5]))
@@ -305,9 +303,7 @@ def twisted_prism(rng: np.random.Generator) -> Mesh:
         [np.linspace(a, b, 12, endpoint=False) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
     )
     levels = np.linspace(0, rng.uniform(1.8, 3.5), 40)
-    return extrude(
-        outline, levels, np.linspace(1, rng.uniform(0.4, 1.1), 40), rng.uniform(0.4, 2.6) * rng.choice([-1, 1])
-    )
+    return extrude(outline, levels, np.linspace(1, rng.uniform(0.4, 1.1), 40), rng.uniform(0.4, 2.6) * rng.choice([-1, 1]))
 
 
 def arch(rng: np.random.Generator) -> Mesh:

@@ -157,9 +157,7 @@ def marching_cubes(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return surface, np.ascontiguousarray(triangles)
 
 
-def visible_components(
-    surface: np.ndarray, triangles: np.ndarray, min_area_share: float
-) -> tuple[np.ndarray, np.ndarray]:
+def visible_components(surface: np.ndarray, triangles: np.ndarray, min_area_share: float) -> tuple[np.ndarray, np.ndarray]:
     """Without components of under that share of the area, and without those of which no ray from outside hits a
     face."""
     component = measure.vertex_components(triangles, len(surface))[triangles[:, 0]]

@@ -37,15 +37,11 @@ def picture(vertices: np.ndarray, faces: np.ndarray, tile: int = TILE) -> np.nda
     light = np.array([-0.4, -0.75, 0.55]) / np.linalg.norm([-0.4, -0.75, 0.55])
     shade = 60 + 190 * np.clip(normals[first] @ light, 0, 1)
     back = normals[first, 1] > 0.2
-    image[pixel[first]] = np.where(
-        back[:, None], np.array([200.0, 40, 40]), shade[:, None] * np.array([0.85, 0.92, 1.0])
-    )
+    image[pixel[first]] = np.where(back[:, None], np.array([200.0, 40, 40]), shade[:, None] * np.array([0.85, 0.92, 1.0]))
     return image.reshape(tile, tile, 3).astype(np.uint8)
 
 
-def write_sheet(
-    path: Path, rows: list[tuple[str, list[tuple[np.ndarray, np.ndarray] | None]]], columns: int = 1
-) -> None:
+def write_sheet(path: Path, rows: list[tuple[str, list[tuple[np.ndarray, np.ndarray] | None]]], columns: int = 1) -> None:
     """A PNG: one row of pictures per object, its name below, ``columns`` objects side by side."""
     from PIL import Image, ImageDraw
 

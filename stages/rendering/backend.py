@@ -84,9 +84,7 @@ def _proof(candidate: str) -> bool:
     path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-m", "stages.rendering.backend", candidate]
     try:
-        child = subprocess.run(
-            command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, timeout=PROBE_SECONDS
-        )
+        child = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, timeout=PROBE_SECONDS)
     except subprocess.TimeoutExpired:
         log.info("renderer %s did not finish its trial within %g s", candidate, PROBE_SECONDS)
         return False

@@ -193,10 +193,7 @@ def trace_paths(scene, lights, albedo, ray, rng, limits, hide):
         sampled &= ~scene.ray_test(shadow, sampled)
         light_pdf = density * distance2 / dr.maximum(cosine, 1e-9)
         value = (
-            throughput
-            * reflected
-            * dr.gather(mi.Color3f, lights.emission, triangle)
-            * (mis_weight(light_pdf, pdf) / light_pdf)
+            throughput * reflected * dr.gather(mi.Color3f, lights.emission, triangle) * (mis_weight(light_pdf, pdf) / light_pdf)
         )
         value = dr.select(sampled, clamped(value, dr.select(bounce > 0, clamp, dr.inf)), 0)
         slots = _add(slots, dr.gather(mi.Int32, lights.slot, triangle), value)
@@ -388,10 +385,7 @@ class JitRenderer:
         local = dr.normalize(mi.Vector3f(x, -y, -dr.gather(mi.Float, focal, view)))
         entry = [dr.gather(mi.Float, cameras, 12 * view + index) for index in range(12)]
         direction = mi.Vector3f(
-            *[
-                entry[4 * axis] * local.x + entry[4 * axis + 1] * local.y + entry[4 * axis + 2] * local.z
-                for axis in range(3)
-            ]
+            *[entry[4 * axis] * local.x + entry[4 * axis + 1] * local.y + entry[4 * axis + 2] * local.z for axis in range(3)]
         )
         return mi.Ray3f(mi.Point3f(entry[3], entry[7], entry[11]), dr.normalize(direction))
 

@@ -122,9 +122,7 @@ class ScalarRenderer:
                 "alpha": {"type": "path", "max_depth": 2},
             }
         )
-        image = np.array(
-            mi.render(self.first_hit_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed), np.float32
-        )
+        image = np.array(mi.render(self.first_hit_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed), np.float32)
         coverage, albedo, normal, depth = image[..., 3], image[..., 4:7], image[..., 7:10], image[..., 10]
         depth = np.where(coverage > 0, depth / np.maximum(coverage, 1e-6), 0)
         nearest = float(depth[coverage > 0].min(initial=np.inf))

@@ -45,9 +45,7 @@ def material(albedo_only: bool = False) -> mi.BSDF:
     return mi.load_dict({"type": "twosided", "bsdf": blend})
 
 
-def surface_mesh(
-    scene: SceneRecord, faces: np.ndarray, bsdf: mi.BSDF | None = None, albedo_only: bool = False
-) -> mi.Mesh:
+def surface_mesh(scene: SceneRecord, faces: np.ndarray, bsdf: mi.BSDF | None = None, albedo_only: bool = False) -> mi.Mesh:
     """The triangles ``faces`` (indices) as one mesh; triangle i of the mesh is faces[i]."""
     emits = scene.light_index[faces] >= 0
     black = np.where(emits, np.float32(0), np.float32(1))[:, None]
@@ -81,9 +79,7 @@ def mesh_of(
     mesh = mi.Mesh("triangles", 3 * count, count, props=props, has_vertex_normals=normals is not None)
     params = mi.traverse(mesh)
     params["vertex_positions"] = _floats(triangles)
-    params["faces"] = (
-        np.arange(3 * count, dtype=np.uint32) if _scalar() else mi.UInt32(np.arange(3 * count, dtype=np.uint32))
-    )
+    params["faces"] = np.arange(3 * count, dtype=np.uint32) if _scalar() else mi.UInt32(np.arange(3 * count, dtype=np.uint32))
     if normals is not None:
         params["vertex_normals"] = _floats(normals)
     params.update()

@@ -11,7 +11,7 @@ import torch
 
 from model.config import ModelConfig
 from model.renderformer import RenderFormer
-from model.training import LOG, FitConfig, fit, learning_rate, predict
+from model.training import LOG, FitConfig, fit, predict, schedule
 from tests.model.synthetic import batch
 from tests.model.test_config import MICRO
 
@@ -117,12 +117,12 @@ def test_a_run_of_non_finite_steps_stops(tmp_path):
 
 
 def test_schedule():
-    config = settings(steps=100, warmup=10, lr=1.0)
-    rates = [learning_rate(config, step) for step in range(100)]
+    config = settings(steps=100, warmup=10)
+    rates = [schedule(config, step) for step in range(100)]
     assert rates[0] == pytest.approx(0.1) and max(rates) == rates[9] == rates[10] == 1.0
     assert all(a >= b for a, b in zip(rates[10:], rates[11:], strict=False)) and rates[-1] < 0.01
-    long = settings(steps=130, warmup=10, lr=1.0, decay_steps=100, final_lr=0.1)
-    assert learning_rate(long, 100) == learning_rate(long, 129) == pytest.approx(0.1)
+    long = settings(steps=130, warmup=10, decay_steps=100, final_lr=0.1)
+    assert schedule(long, 100) == schedule(long, 129) == pytest.approx(0.1)
 
 
 def test_gradient_leak_revives_negative_pixels_and_changes_no_value():

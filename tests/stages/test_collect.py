@@ -250,9 +250,7 @@ def test_real_files_are_taken_as_their_readme_expects(shared_data: Path) -> None
         **{f"odd/{name}": "no_faces" for name in ("empty.stl", "empty.obj", "empty.ply", "empty_nodes.glb")},
         **{f"odd/{name}": "no_faces" for name in ("points_ascii.ply", "points_bin.ply")},
     }
-    either = {
-        f"odd/{name}" for name in ("notenoughindices.obj", "deg_faces.obj", "soup.stl", "busted.STL", "mirror.ply")
-    }
+    either = {f"odd/{name}" for name in ("notenoughindices.obj", "deg_faces.obj", "soup.stl", "busted.STL", "mirror.ply")}
     for name in mesh_files(folder_config(root)):
         try:
             load.load_mesh(root / name, root, 1 << 28, 2_000_000)
@@ -440,9 +438,7 @@ def test_objaverse_uses_the_package_in_the_worker(tmp_path: Path, monkeypatch: p
     package.load_annotations = lambda uids: {uid: notes for uid in uids}
     monkeypatch.setitem(sys.modules, "objaverse", package)
     (tmp_path / "ids.txt").write_text("u2\nu1\n")
-    config = parse(
-        Collect.Config, {"name": "objaverse", "ids": ["gone"], "ids_file": str(tmp_path / "ids.txt")}, "collect"
-    )
+    config = parse(Collect.Config, {"name": "objaverse", "ids": ["gone"], "ids_file": str(tmp_path / "ids.txt")}, "collect")
     stage = Collect()
     assert objaverse_ids(config) == ["gone", "u1", "u2"] == list(stage.identity(config, blake)["items"])
     worker = stage.open(config, {}, {})

@@ -132,10 +132,7 @@ def test_measures_of_known_shapes() -> None:
     cube = box((1, 1, 1))
     assert measure.measures(*cube)["area"] == pytest.approx(6) and measure.measures(*cube)["volume"] == pytest.approx(1)
     compared = measure.Reference(*cube).compare(*box((1.1, 1.1, 1.1)))
-    assert (
-        compared["distance"] == pytest.approx(0.05 / np.sqrt(3), rel=0.1)
-        and compared["inside"] == 0 == compared["flipped"]
-    )
+    assert compared["distance"] == pytest.approx(0.05 / np.sqrt(3), rel=0.1) and compared["inside"] == 0 == compared["flipped"]
     vertices, faces = box((1, 1, 1))
     assert measure.Reference(*cube).compare(vertices, faces[:, ::-1])["flipped"] > 0.9
     hidden = measure.Reference(*join(box((1, 1, 1)), box((0.5, 0.5, 0.5))))
@@ -152,9 +149,7 @@ def test_ladder_is_on_budget_watertight_and_close() -> None:
     rungs = decimator.ladder([lambda: remesher.remesh(vertices, mesh[1], GRID)], budgets, "pymeshlab", gates)
     assert sorted(rungs) == budgets
     for budget, rung in rungs.items():
-        assert (
-            budget - 3 <= len(rung.faces) <= budget and rung.measures["watertight"] and rung.measures["flipped"] <= 0.01
-        )
+        assert budget - 3 <= len(rung.faces) <= budget and rung.measures["watertight"] and rung.measures["flipped"] <= 0.01
     assert rungs[512].measures["distance"] < rungs[64].measures["distance"] <= 0.02
     assert rungs[512].measures["area_spread"] < 0.7
 

@@ -64,10 +64,7 @@ def build(surfaces, lights, cameras, fov=40.0):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
 
     def column(index, width):
-        rows = [
-            np.broadcast_to(np.asarray(part[index], np.float32), (n, width))
-            for part, n in zip(parts, counts, strict=True)
-        ]
+        rows = [np.broadcast_to(np.asarray(part[index], np.float32), (n, width)) for part, n in zip(parts, counts, strict=True)]
         return np.concatenate(rows)
 
     return SceneRecord(
@@ -96,9 +93,7 @@ def clutter(lights=3, cameras=2):
     lit = []
     for _ in range(lights):
         direction = rng.normal(size=3) * (1, 1, 0.3) + (0, -1.5, 1.5)
-        lit.append(
-            ((2 * direction / np.linalg.norm(direction) + rng.normal(size=(1, 3, 3)) * 0.12), rng.uniform(200, 500, 3))
-        )
+        lit.append(((2 * direction / np.linalg.norm(direction) + rng.normal(size=(1, 3, 3)) * 0.12), rng.uniform(200, 500, 3)))
     poses = [camera((0.4 * index - 0.2, -2, 0.5)) for index in range(cameras)]
     return build(surfaces, lit, poses)
 
@@ -288,9 +283,7 @@ def test_denoiser_gives_the_same_bytes_for_any_thread_count():
 def test_denoising_comes_nearer_to_the_truth(backend):
     scene = clutter(cameras=1)
     truth = render_views(scene, 32, spp=1024, seed=9, backend=backend, denoise=False)[0].image
-    noisy, clean = (
-        render_views(scene, 32, spp=8, seed=0, backend=backend, denoise=flag)[0].image for flag in (False, True)
-    )
+    noisy, clean = (render_views(scene, 32, spp=8, seed=0, backend=backend, denoise=flag)[0].image for flag in (False, True))
 
     def error(image):
         return np.abs(np.log10(1 + image) - np.log10(1 + truth)).mean()
