@@ -64,7 +64,8 @@ def command_ls(store: Store, arguments: argparse.Namespace) -> int:
         if arguments.stage in (None, path.parent.name):
             holder = store.claim(path.parent.name, path.name.removesuffix(".partial")).holder()
             state = f"in the making by process {holder['pid']} on {holder['host']}" if holder else "unfinished"
-            print(f"{path.parent.name}/{path.name[:12]}.partial  {len(list((path / 'markers').glob('*.json')))} parts, {state}")
+            parts = len(list((path / "markers").glob("*.json")))
+            print(f"{path.parent.name}/{path.name[:12]}.partial  {parts} parts, {state}")
     if not artifacts:
         print(f"no artifacts in {store.root}")
     return 0
@@ -78,9 +79,8 @@ def command_show(store: Store, arguments: argparse.Namespace) -> int:
     print(f"  path      {artifact.path}")
     print(f"  key       {artifact.key}{'  (pinned)' if store.pinned(artifact.key) else ''}")
     print(f"  digest    {artifact.digest}")
-    print(
-        f"  records   {outputs['records']} of {outputs['items']} items in {len(outputs['parts'])} parts, {size(outputs['bytes'])}"
-    )
+    parts = len(outputs["parts"])
+    print(f"  records   {outputs['records']} of {outputs['items']} items in {parts} parts, {size(outputs['bytes'])}")
     for reason, count in sorted(outputs["rejects"].items()):
         print(f"  rejected  {count} {reason}")
     for reject in artifact.rejects()[: arguments.rejects]:
@@ -92,9 +92,8 @@ def command_show(store: Store, arguments: argparse.Namespace) -> int:
         f"  made      {when} in {duration(seconds)} on {manifest['machine']['host']}, {manifest['machine']['gpu'] or 'no GPU'}"
     )
     print(f"  command   {manifest['command']}")
-    print(
-        f"  code      version {manifest['preimage']['version']}, commit {code['commit']}{' with changes' if code['dirty'] else ''}"
-    )
+    dirty = " with changes" if code["dirty"] else ""
+    print(f"  code      version {manifest['preimage']['version']}, commit {code['commit']}{dirty}")
     for name, value in sorted(_flat(manifest["environment"]).items()):
         if name:
             print(f"  runtime   {name} = {value}")

@@ -121,7 +121,7 @@ def build_parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     sub.add_argument("scene", help="scene file: .json or .h5")
     sub.add_argument("--checkpoint", required=True, help="released-format folder, or a train artifact's key, name or 'train'")
-    sub.add_argument("-o", "--out", required=True, help="output .exr (linear) or .png (tone-mapped)")
+    sub.add_argument("-o", "--out", required=True, help="output .exr (linear) or .png (sRGB)")
     sub.add_argument("--resolution", type=int, default=512, help="pixels per side, divisible by 8 (default: 512)")
     sub.add_argument("--view", type=view_argument, default=0, help="camera number, or 'all' (default: 0)")
     sub.add_argument("--device", default="auto", help="cpu, cuda or auto (default)")

@@ -46,13 +46,6 @@ def test_every_model_is_a_valid_config(model):
     parse(SYSTEM.stage("train").Config, compose([f"model={model}"])["train"], "train")
 
 
-@pytest.mark.parametrize("experiment", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
-def test_every_experiment_composes(experiment):
-    root = compose([f"experiment={experiment}"])
-    for stage in SYSTEM.modules:
-        parse(SYSTEM.stage(stage).Config, root[stage], stage)
-
-
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
