@@ -30,7 +30,6 @@ from model.layers import (
 
 PATCH_NORMAL = (0.5, 0.5, 1.0)  # the released format's constant tangent-space normal
 EMISSION = 3  # emission is the last three channels
-RAY_SPREAD = 4.0  # initial amplification of what tells rays apart
 
 
 @dataclass
@@ -168,8 +167,6 @@ class ViewTransformer(nn.Module):
             self.out_proj = nn.Linear(dim, pixels)
         self.gradient_leak = 0.0
         self._start_bright()
-        if config.turn_to_cam_coord:
-            self._start_spread()
 
     def _start_bright(self) -> None:
         """Start near a constant grey: ELU with alpha 1e-3 passes next to no gradient to pixels that start negative."""
@@ -177,14 +174,6 @@ class ViewTransformer(nn.Module):
         with torch.no_grad():
             last.weight.mul_(0.1)
             last.bias.fill_(0.1)
-
-    def _start_spread(self) -> None:
-        """Start with ray embeddings that differ: in the camera frame all rays point to about (0, 0, -1), and that constant
-        would fill the normalised embedding. Take it out through the bias and amplify the rest (initial values only)."""
-        encoder = self.ray_map_encoder
-        with torch.no_grad():
-            encoder.weight.mul_(RAY_SPREAD)
-            encoder.bias.add_(0.95 * encoder.weight[:, 2 * self.config.patch_size**2 :].sum(dim=1))
 
     def _encode_position(self, positions: Tensor) -> Tensor:
         return self.token_pos_pe_norm(self.pe_token_proj(sinusoids(positions, self.config.vertex_pe_num_freqs)))

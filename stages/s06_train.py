@@ -62,10 +62,10 @@ class TrainConfig(StageConfig):
     seed: int = 0
     model: ModelSection = ModelSection()
     # Schedule
-    steps: int = Field(950, ge=1)
+    steps: int = Field(1400, ge=1)
     batch_scenes: int = Field(4, ge=1)
     views_per_scene: int = Field(4, ge=1)
-    lr: float = Field(2e-3, gt=0)
+    lr: float = Field(1e-3, gt=0)
     warmup: int = Field(50, ge=0)  # steps
     decay_steps: int | None = Field(None, ge=1)  # step at which the cosine ends; null: the last step
     final_lr: float = Field(0.0, ge=0, le=1)  # after the cosine, as a share of lr
@@ -78,6 +78,7 @@ class TrainConfig(StageConfig):
     lpips: float = Field(0.0, ge=0)
     # Share of the gradient that pixels below 0 get besides ELU's own 1e-3: at high learning rates the output else dies
     gradient_leak: float = Field(0.1, ge=0, le=1)
+    informed_start: bool = True  # initial values that say what is known (model.initial), for runs of minutes
     # Augmentation
     rotate: bool = False  # turn the scene at random: the view-independent stage must not learn an orientation
     translate_sigma: float = Field(0.0, ge=0)  # and move it; scene units
@@ -115,6 +116,7 @@ class Train(RunStage):
         import torch
 
         from model import checkpoint
+        from model.initial import start_informed
         from model.renderformer import RenderFormer
         from model.training import LOG, FitConfig, fit
         from stages.dataset import Batches, ShardDataset, evaluation_samples, prefetch
@@ -129,6 +131,8 @@ class Train(RunStage):
 
         torch.manual_seed(config.seed)
         model = RenderFormer(config.model.build())
+        if config.informed_start:
+            start_informed(model)
         draft.log(
             f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f}M parameters ({config.model.name}) on {device}, "
             f"{torch.get_num_threads()} threads; {len(train)} training and {len(validation)} validation scenes"
