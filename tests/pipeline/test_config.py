@@ -78,7 +78,7 @@ def test_command_line_accepts_the_sweep_flag_anywhere(tmp_path, flags):
     command = [sys.executable, "-m", "pipeline", *words, f"hydra.sweep.dir={tmp_path}/r", f"hydra.run.dir={tmp_path}/r"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("train ") == (2 if flags else 1)
+    assert done.stdout.count("06 train") == (2 if flags else 1)
 
 
 def test_error_is_one_line_with_a_status(tmp_path):
