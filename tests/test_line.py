@@ -31,7 +31,7 @@ def run(folder: Path, *words: str, status: int = 0) -> str:
     command += [f"hydra.run.dir={folder}/runs", f"hydra.sweep.dir={folder}/runs"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == status, done.stdout + done.stderr
-    return done.stdout + done.stderr
+    return done.stdout
 
 
 @pytest.fixture(scope="module")
