@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import nearest
 from pipeline.errors import UserError
 from pipeline.hydra_config import compose
 from pipeline.progress import duration
@@ -253,6 +252,3 @@ def _existing(path: str) -> Store:
     if not Path(path).is_dir():
         raise UserError(f"there is no store at {path}: give --store DIR, or make one with `make data`")
     return Store(path)
-
-
-__all__ = ["add_commands", "difference", "nearest"]

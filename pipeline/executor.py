@@ -42,11 +42,6 @@ THREAD_VARIABLES = (
     "NUMEXPR_NUM_THREADS",
     THREADS_VARIABLE,
 )
-KILLED_REASONS = {
-    "crash": "the worker died while it was at work on this item, twice",
-    "time": "the item took longer than the stage's limit, twice",
-    "memory": "the item took more memory than the stage's limit, twice",
-}
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field
 from pipeline.code import code_digest, commit
 from pipeline.config import Limits, Section, StageConfig, nearest, parse
 from pipeline.errors import UserError
-from pipeline.executor import KILLED_REASONS, run_parts
+from pipeline.executor import run_parts
 from pipeline.keys import SCHEME, canonical, digest_of
 from pipeline.progress import Progress, duration
 from pipeline.stage import Item, MapStage, RunStage, Stage, System, load_system
@@ -433,6 +433,3 @@ def machine(packages: Iterable[str]) -> dict[str, Any]:
         "gpu": _gpu(),
         "packages": versions,
     }
-
-
-__all__ = ["KILLED_REASONS", "Planned", "RunConfig", "make_plan", "run_pipeline", "split_config"]

@@ -64,9 +64,9 @@ def predict(
     .exr holds linear radiance, .png sRGB of radiance clamped to [0, 1].
     """
     from model import checkpoint
+    from stages.device import choose_device
     from stages.exr import write_rgb
     from stages.released import load_scene
-    from stages.s06_train import choose_device
 
     if out.suffix.lower() not in (".exr", ".png"):
         raise UserError(f"{out}: the output must end in .exr (linear) or .png")
@@ -86,7 +86,7 @@ def predict(
             file=sys.stderr,
         )
     views = list(range(count)) if view == "all" else [int(view)]
-    images = predict_scene(model, scene, views, resolution, choose_device(device))
+    images = predict_scene(model, scene, views, resolution, choose_device(device, "--device"))
     written = []
     for index, image in zip(views, images, strict=True):
         path = out.with_name(f"{out.stem}-{index}{out.suffix}") if view == "all" else out

@@ -23,7 +23,7 @@ from pipeline.errors import Reject, UserError
 from pipeline.keys import seed_for
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.records import SceneRecord
-from stages.scenes.laws import CameraLaw, Laws, LightLaw, MaterialLaw, ObjectLaw, Plan, WallLaw, WeightLaw, draw_plan
+from stages.scenes.laws import Laws, Plan, draw_plan
 
 MIN_OBJECTS = 2  # per split: with one object a split's scenes would all show the same thing
 KEPT_MESHES = 512  # objects that a worker holds in memory
@@ -37,17 +37,11 @@ class SceneCount(Section):
     test: int = Field(24, ge=0)
 
 
-class SceneConfig(StageConfig):
+class SceneConfig(StageConfig, Laws):
     name: Literal["released", "paper"] = "released"  # the law's name; its numbers are below
     seed: int = 0
     count: SceneCount = count(SceneCount())
     max_triangles: int = Field(768, ge=1)  # walls, objects and lights together
-    weights: WeightLaw = WeightLaw()
-    walls: WallLaw = WallLaw()
-    objects: ObjectLaw = ObjectLaw()
-    material: MaterialLaw = MaterialLaw()
-    lights: LightLaw = LightLaw()
-    cameras: CameraLaw = CameraLaw()
 
     def laws(self) -> Laws:
         return Laws(**{name: getattr(self, name) for name in Laws.model_fields})

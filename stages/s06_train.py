@@ -18,6 +18,7 @@ from pipeline.config import Section, StageConfig, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, RunStage
 from stages.dataset import BatchConfig, Relight
+from stages.device import choose_device
 
 if TYPE_CHECKING:
     from model.config import ModelConfig
@@ -121,7 +122,7 @@ class Train(RunStage):
         from model.training import LOG, FitConfig, fit
         from stages.dataset import Batches, ShardDataset, evaluation_samples, prefetch
 
-        device = choose_device(config.device)
+        device = choose_device(config.device, "train.device")
         if config.threads is not None:
             torch.set_num_threads(config.threads)
         train = ShardDataset(inputs["shard"], "train", config.max_triangles)
@@ -180,19 +181,6 @@ class Train(RunStage):
         plot_curve(rows, draft.files / "curve.png", f"{config.model.name}, {config.steps:,} steps")
         draft.note("training", summary)
         return ["checkpoint/config.json", "checkpoint/model.safetensors"]
-
-
-def choose_device(wanted: str) -> str:
-    """auto: CUDA where there is one, else the CPU."""
-    import torch
-
-    if wanted == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if wanted not in ("cpu", "cuda"):
-        raise UserError(f"train.device={wanted!r} is unknown: auto, cpu or cuda")
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise UserError("train.device=cuda, but torch sees no GPU: use train.device=cpu, or install the CUDA build of torch")
-    return wanted
 
 
 def plot_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:

@@ -21,6 +21,7 @@ from pydantic import Field
 from pipeline.config import StageConfig, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
+from stages.device import choose_device
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -64,14 +65,12 @@ class Evaluate(MapStage):
 
     def environment(self, config: EvaluateConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
         """The device, one for the whole artifact: another rounds otherwise."""
-        import torch
-
-        cuda = torch.cuda.is_available()
-        wanted = previous["device"] if previous else config.device
-        if wanted == "cuda" and not cuda:
-            begun = "this evaluation was begun with it; use that machine, or give another split" if previous else ""
-            raise UserError(f"evaluate.device=cuda: PyTorch finds no CUDA device here; {begun or 'use auto or cpu'}")
-        return {"device": ("cuda" if cuda else "cpu") if wanted == "auto" else wanted}
+        if previous is None:
+            return {"device": choose_device(config.device, "evaluate.device")}
+        try:
+            return {"device": choose_device(previous["device"], "evaluate.device")}
+        except UserError as error:
+            raise UserError(f"this evaluation was begun with it; use that machine, or give another split ({error})") from None
 
     def max_workers(self, config: EvaluateConfig, environment: dict[str, Any]) -> int | None:
         return 1 if environment["device"] == "cuda" else None
