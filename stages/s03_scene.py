@@ -32,7 +32,7 @@ KEPT_MESHES = 512  # objects that a worker holds in memory
 class SceneCount(Section):
     """Scenes per split."""
 
-    train: int = Field(480, ge=0)
+    train: int = Field(880, ge=0)
     validation: int = Field(16, ge=0)
     test: int = Field(24, ge=0)
 

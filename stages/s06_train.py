@@ -63,7 +63,7 @@ class TrainConfig(StageConfig):
     seed: int = 0
     model: ModelSection = ModelSection()
     # Schedule
-    steps: int = Field(1400, ge=1)
+    steps: int = Field(1500, ge=1)
     batch_scenes: int = Field(4, ge=1)
     views_per_scene: int = Field(4, ge=1)
     lr: float = Field(1e-3, gt=0)
@@ -71,7 +71,7 @@ class TrainConfig(StageConfig):
     decay_steps: int | None = Field(None, ge=1)  # step at which the cosine ends; null: the last step
     final_lr: float = Field(0.0, ge=0, le=1)  # after the cosine, as a share of lr
     optimizer: Literal["adamw", "muon"] = "muon"
-    muon_lr: float = Field(0.02, gt=0)  # highest learning rate of Muon's weights: a step's size in spectral norm
+    muon_lr: float = Field(0.005, gt=0)  # highest learning rate of Muon's weights: a step's size in spectral norm
     weight_decay: float = Field(0.01, ge=0)
     clip: float = Field(1.0, gt=0)  # largest gradient norm
     precision: Literal["mixed", "fp32"] = "mixed"  # mixed: view-independent stage in bfloat16 on a GPU; the CPU uses fp32
