@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -99,14 +100,30 @@ def command_show(store: Store, arguments: argparse.Namespace) -> int:
     for name, value in sorted(_flat(manifest["preimage"]["params"]).items()):
         if not name.startswith("identity.items"):
             print(f"  config    {artifact.stage}.{name} = {_short(value)}")
-    for name, value in _flat(manifest["summary"]).items():
-        if name:
-            print(f"  summary   {name} = {value}")
+    for name, value in manifest["summary"].items():
+        _summary(name, value)
     for name, entry in outputs["files"].items():
         print(f"  file      files/{name}  {size(entry['bytes'])}")
     print("  lineage")
     _lineage(store, artifact, "    ", set())
     return 0
+
+
+def _summary(name: str, value: Any) -> None:
+    """A group of plain values, such as a distribution, is one line."""
+    shown = name.removeprefix("summary.")
+    if not isinstance(value, Mapping):
+        print(f"  summary   {shown} = {value}")
+    elif not any(isinstance(item, Mapping) for item in value.values()):
+        print(f"  summary   {shown}: " + (", ".join(f"{key} {value[key]}" for key in sorted(value, key=_natural)) or "none"))
+    else:
+        for key in sorted(value, key=_natural):
+            _summary(f"{name}.{key}", value[key])
+
+
+def _natural(name: str) -> list[tuple[bool, int, str]]:
+    """Sorts p10 before p100."""
+    return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _lineage(store: Store, artifact: Artifact, indent: str, seen: set[str]) -> None:

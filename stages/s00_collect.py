@@ -67,7 +67,7 @@ class ObjaverseConfig(CollectConfig):
 
 class Collect(MapStage):
     name: ClassVar[str] = "collect"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     Config: ClassVar[Any] = Annotated[ProceduralConfig | FolderConfig | ObjaverseConfig, Field(discriminator="name")]
     reasons: ClassVar[dict[str, str]] = {
         "unreadable": "the file is truncated, malformed or not what its suffix says",

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -31,20 +31,28 @@ SHEET_OBJECTS = 48  # at most this many on the contact sheet
 
 
 class DecimateConfig(StageConfig):
-    budgets: list[int] = Field([64, 128, 256, 512], min_length=1)  # most faces of each rung
+    budgets: list[int] = Field([64, 128, 256, 512, 1024, 1188, 2048, 3072, 3968], min_length=1)  # most faces of each rung
     method: Literal["pymeshlab", "fast_simplification"] = "pymeshlab"
-    coarser: list[int] = [64, 40]  # grids to start again from, in this order, when a rung is missed
+    # pymeshlab's, tried in this order until the triangles are even; more: evener, farther from the surface; 0: QSlim alone
+    planar_weights: list[Annotated[float, Field(ge=0, le=1)]] = Field([0.001, 0.003], min_length=1)
+    even: float = Field(0.5, ge=0)  # area spread (deviation over mean) at which triangles are even
+    nearer: int = Field(8, ge=0)  # times the largest budget: fast_simplification brings a mesh that near first; 0: never
+    coarser: list[int] = [96, 64, 40]  # grids to start again from, in this order, when a rung is missed
     max_distance: float = Field(0.02, gt=0)  # of a rung to the original's outer surface, in diagonals
-    min_kept: float = Field(0.0, ge=0, le=1)  # of the outer surface, within 1 % of the diagonal
+    min_kept: float = Field(0.9, ge=0, le=1)  # of the outer surface that remesh kept, within 1 % of the diagonal
+    min_kept_coarse: float = Field(0.5, ge=0, le=1)  # the same, for rungs of under 256 faces
+    max_inside: float = Field(0.35, ge=0, le=1)  # of the rung's area hidden from outside
     max_flipped: float = Field(0.01, ge=0, le=1)  # of rays from outside that meet the back of a face
+    max_crossing: float = Field(0.05, ge=0, le=1)  # of the faces that pass through another one
+    max_slivers: float = Field(0.05, ge=0, le=1)  # of the faces with an angle under 5 degrees
 
 
 class Decimate(MapStage):
     name: ClassVar[str] = "decimate"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     inputs: ClassVar[tuple[str, ...]] = ("collect", "remesh")
     Config: ClassVar[Any] = DecimateConfig
-    reasons: ClassVar[dict[str, str]] = {"no_rung": "no budget was reached with a watertight mesh close enough to the original"}
+    reasons: ClassVar[dict[str, str]] = {"no_rung": "no budget was reached with a mesh that passes the gates"}
     limits: ClassVar[dict[str, float]] = {"cpu_s": 300.0, "wall_s": 900.0, "memory_gb": 6.0}
 
     def slug(self, config: DecimateConfig) -> str:
@@ -67,21 +75,35 @@ class Decimate(MapStage):
         original = MeshRecord.from_record(inputs["collect"].read(item.id))
         fine = MeshRecord.from_record(inputs["remesh"].read(item.id))
         reference = measure.Reference(original.vertices, original.faces)
-        gates = decimator.Gates(reference, config.max_distance, config.min_kept, config.max_flipped)
+        gates = decimator.Gates(
+            reference,
+            most={name: getattr(config, f"max_{name}") for name in ("distance", "inside", "flipped", "crossing", "slivers")},
+            least={"kept": config.min_kept * fine.meta["kept"]},
+            least_coarse={"kept": config.min_kept_coarse * fine.meta["kept"]},
+        )
+        near = config.nearer * max(config.budgets) or len(fine.faces)
 
         def coarse(resolution: int) -> tuple[np.ndarray, np.ndarray] | None:
             try:
-                return remesher.remesh(original.vertices, original.faces, resolution)
+                mesh = remesher.remesh(original.vertices, original.faces, resolution, **fine.meta["settings"])
+                return decimator.brought_nearer(*mesh, near)
             except Reject:  # a coarser grid may hold nothing of it: then this source has nothing to offer
                 return None
 
-        sources = [lambda: (fine.vertices.astype(np.float64), fine.faces.astype(np.int64))]
+        def reducer(weight: float) -> Callable[[decimator.Mesh, int], decimator.Mesh]:
+            return lambda mesh, budget: decimator.collapse(*mesh, budget, config.method, weight)
+
+        finest = fine.vertices.astype(np.float64), fine.faces.astype(np.int64)
+        sources = [lambda: decimator.brought_nearer(*finest, near)]
         sources += [lambda resolution=resolution: coarse(resolution) for resolution in config.coarser]
-        rungs = decimator.ladder(sources, config.budgets, config.method, gates)
+        weights = config.planar_weights if config.method == "pymeshlab" else [0.0]
+        rungs = decimator.ladder(sources, config.budgets, [reducer(weight) for weight in weights], gates, config.even)
+        missed = {str(budget): why for budget, why in sorted(gates.refused.items()) if budget not in rungs}
         if not rungs:
-            raise Reject("no_rung", gates.last)
+            raise Reject("no_rung", "; ".join(f"{why} at {budget}" for budget, why in missed.items()))
         meta = {key: fine.meta[key] for key in ("object_id", "content_hash", "family", "source", "origin", "licence")}
         meta["remeshed"] = {key: fine.meta[key] for key in ("faces", "distance", "kept", "inside", "area_spread")}
+        meta["missed"] = missed  # budget -> why there is no such rung
         meta["rungs"] = {str(budget): rung.measures for budget, rung in sorted(rungs.items())}
         yield rungs_record(item.id, {budget: (rung.vertices, rung.faces) for budget, rung in rungs.items()}, meta)
 
@@ -101,7 +123,7 @@ class Decimate(MapStage):
         summary: dict[str, Any] = {"objects": len(listed), "splits": dict(sorted(Counter(splits.values()).items()))}
         for budget in sorted(config.budgets):
             reached = [meta["rungs"][str(budget)] for meta in metas.values() if str(budget) in meta["rungs"]]
-            names = ("distance", "kept", "area_spread", "flipped", "min_angle_deg")
+            names = ("distance", "kept", "area_spread", "min_angle_deg", "slivers", "crossing", "flipped")
             summary[f"rung_{budget}"] = {
                 "objects": len(reached),
                 **{name: catalogue.spread([m[name] for m in reached]) for name in names},

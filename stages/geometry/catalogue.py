@@ -54,11 +54,11 @@ def fill_splits(objects: list[dict[str, Any]], held: Mapping[str, str]) -> dict[
 
 
 def spread(values: list[float]) -> dict[str, float]:
-    """Smallest, 10th percentile, median, 90th percentile and largest, for summaries."""
+    """Percentiles for summaries: p0 is the smallest, p100 the largest."""
     if not values:
         return {}
-    numbers = np.percentile(values, [0, 10, 50, 90, 100])
-    return {name: round(float(x), 5) for name, x in zip(("min", "p10", "median", "p90", "max"), numbers, strict=True)}
+    percents = (0, 10, 50, 90, 100)
+    return {f"p{percent}": round(float(x), 5) for percent, x in zip(percents, np.percentile(values, percents), strict=True)}
 
 
 def find_duplicates(

@@ -260,6 +260,7 @@ def _prepare_gltf(
         if view["byteOffset"] + view["byteLength"] > end:
             raise Reject("unreadable", "a buffer view past the end of its buffer")
         view["buffer"] = 0
+    _check_draco(tree, joined)
     for name in ("materials", "textures", "images", "samplers", "skins", "cameras", "animations", "extensions"):
         tree.pop(name, None)
     for mesh in tree.get("meshes", []):
@@ -326,6 +327,37 @@ def _uses_draco(tree: dict[str, Any]) -> bool:
     return DRACO in tree.get("extensionsRequired", []) or any(
         DRACO in primitive.get("extensions", {}) for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]
     )
+
+
+def _check_draco(tree: dict[str, Any], data: bytes | bytearray) -> None:
+    """A few kilobytes of Draco can hold millions of faces: their header may not claim more than the accessors, which
+    count against the limit, do."""
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            if DRACO in primitive.get("extensions", {}):
+                view = tree["bufferViews"][primitive["extensions"][DRACO]["bufferView"]]
+                stated = int(tree["accessors"][primitive["indices"]]["count"]) // 3
+                faces = _draco_faces(bytes(data[view["byteOffset"] :][: min(64, view["byteLength"])]))
+                if faces > stated:
+                    raise Reject("unreadable", f"Draco data of {faces} faces where {stated} are stated")
+
+
+def _draco_faces(head: bytes) -> int:
+    """Faces that a Draco mesh claims to hold, from its first bytes (bitstream 2.2, which glTF prescribes)."""
+    if head[:5] != b"DRACO" or tuple(head[5:8]) != (2, 2, 1):
+        raise Reject("unsupported", "Draco data that is not a mesh of bitstream 2.2")
+    if head[10] & 0x80:  # metadata comes first, of any length: the worker's limits must do
+        return 0
+    numbers, at = [], 11 + head[8]  # sequential: faces, points; edgebreaker: a byte, points, faces
+    for _ in range(2):
+        value = shift = 0
+        while True:
+            byte, at = head[at], at + 1
+            value, shift = value | (byte & 127) << shift, shift + 7
+            if byte < 128:
+                break
+        numbers.append(value)
+    return numbers[head[8]]
 
 
 def _check_graph(tree: dict[str, Any], max_faces: int) -> None:

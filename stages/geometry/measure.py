@@ -7,6 +7,7 @@ from outside reach: a point counts when a ray from it, on the side that faces th
 from __future__ import annotations
 
 import hashlib
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +57,13 @@ def vertex_components(faces: np.ndarray, n_vertices: int) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
+def component_volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(C,) signed volume of every component of a closed mesh; positive where it faces outwards."""
+    a, b, c = np.moveaxis(corners_of(vertices, faces), 1, 0)
+    component = vertex_components(faces, len(vertices))[faces[:, 0]]
+    return np.bincount(component, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
+
+
 def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mesh without unused vertices."""
     used, faces = np.unique(faces, return_inverse=True)
@@ -69,6 +77,16 @@ def min_angle_deg(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     lengths = np.maximum(np.linalg.norm(edges, axis=2), 1e-300)
     cosines = -np.einsum("fij,fij->fi", edges, np.roll(edges, 1, axis=1)) / (lengths * np.roll(lengths, 1, axis=1))
     return np.degrees(np.arccos(np.clip(cosines, -1, 1))).min(axis=1)
+
+
+def crossing(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Share of the faces that pass through another one."""
+    import pymeshlab
+
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32)))
+    meshes.compute_selection_by_self_intersections_per_face()
+    return round(meshes.current_mesh().selected_face_number() / len(faces), 4)
 
 
 def content_hash(vertices: np.ndarray, faces: np.ndarray) -> str:
@@ -120,19 +138,25 @@ def sphere_directions(number: int = 64) -> np.ndarray:
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
 
 
+def embree_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """What ``.run(origins, directions)``, (N, 3) float32, asks: the first face that each ray meets, -1 for none."""
+    from embreex import rtcore_scene
+    from embreex.mesh_construction import TriangleMesh
+
+    scene = rtcore_scene.EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(corners_of(vertices, faces), np.float32))
+    return scene
+
+
 class Visibility:
     """Which points of a mesh's surface a ray from outside reaches."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
-        from embreex import rtcore_scene
-        from embreex.mesh_construction import TriangleMesh
-
         self.radius = diagonal(vertices)
         self.centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
         self.offset = 1e-4 * self.radius
         self.vectors = face_vectors(vertices, faces)
-        self.scene = rtcore_scene.EmbreeScene()
-        self.mesh = TriangleMesh(self.scene, np.ascontiguousarray(corners_of(vertices, faces), np.float32))
+        self.scene = embree_scene(vertices, faces)
 
     def outer(self, points: np.ndarray, normals: np.ndarray, two_sided: bool = True) -> np.ndarray:
         """(N,) bool. One-sided asks only about the side that the normal points to."""

@@ -40,7 +40,8 @@ def remesh(
     origin = (low + high) / 2 - (blocks * BLOCK - 1) / 2 * voxel
     grid = (vertices - origin) / voxel
 
-    distance = narrow_band(grid, faces, blocks, reach=eps + 1.8)
+    # an edge of the grid that crosses level eps has no end farther than eps + 1 from the surface
+    distance = narrow_band(grid, faces, blocks, reach=eps + 1.01)
     value, outside = signed_field(distance, eps)
     fill_cavities(value, outside, [share * resolution for share in CAVITY_RADII])
     if not (value < 0).any():
@@ -50,7 +51,7 @@ def remesh(
     surface = pull_back(surface, triangles, grid, faces, outside, eps, sheet_gap, solid_gap)
     if not measure.watertight(triangles, len(surface)):
         raise Reject("not_watertight", f"grid {resolution}")
-    if measure.volume(surface, triangles) <= 0:
+    if measure.component_volumes(surface, triangles).min() <= 0:
         raise Reject("inside_out", f"grid {resolution}")
     return surface * voxel + origin, triangles
 
@@ -118,6 +119,7 @@ def fill_cavities(value: np.ndarray, outside: np.ndarray, radii: list[float]) ->
     An open scan is a bag: its inner side would take half of the triangles and never be seen. The opening gets the ball
     as its lid.
     """
+    import edt
     from scipy import ndimage
 
     hidden = outside & ~seen_from_outside(outside)
@@ -127,9 +129,9 @@ def fill_cavities(value: np.ndarray, outside: np.ndarray, radii: list[float]) ->
         if hidden.sum() < radius**3:
             return
         if room is None:
-            room = ndimage.distance_transform_edt(np.pad(outside, pad, constant_values=True)).astype(np.float32)
+            room = edt.edt(np.pad(outside, pad, constant_values=True), parallel=1)
         labels, _ = ndimage.label(room > radius)
-        to_ball = ndimage.distance_transform_edt(labels != labels[0, 0, 0])[pad:-pad, pad:-pad, pad:-pad]
+        to_ball = edt.edt(labels != labels[0, 0, 0], parallel=1)[pad:-pad, pad:-pad, pad:-pad]
         pockets, number = ndimage.label(outside & (to_ball > radius))
         sizes = np.bincount(pockets.ravel(), minlength=number + 1)
         dark = np.bincount(pockets.ravel(), hidden.ravel(), minlength=number + 1)
@@ -139,7 +141,7 @@ def fill_cavities(value: np.ndarray, outside: np.ndarray, radii: list[float]) ->
         if not filled.any():
             continue
         lid = ndimage.binary_dilation(filled) & outside & ~filled
-        field = (radius - to_ball).astype(np.float32)
+        field = np.float32(radius) - to_ball
         value[lid] = np.maximum(np.minimum(value[lid], field[lid]), 0.02)
         value[filled] = np.minimum(field[filled], -0.02)
         outside[filled] = False

@@ -242,6 +242,31 @@ def test_draco_without_its_decoder_is_refused_by_name(shared_data: Path, monkeyp
         load.load_mesh(root / "barrel.gltf", root, **LIMITS)
 
 
+def test_draco_data_may_not_hold_more_than_is_stated(tmp_path: Path) -> None:
+    DracoPy = pytest.importorskip("DracoPy")
+    index = np.arange(60 * 60).reshape(60, 60)
+    corners = [index[:-1, :-1], index[1:, :-1], index[1:, 1:]], [index[:-1, :-1], index[1:, 1:], index[:-1, 1:]]
+    faces = np.concatenate([np.stack(three, axis=-1).reshape(-1, 3) for three in corners])
+    points = np.stack([index.ravel() // 60, index.ravel() % 60, 0 * index.ravel()], axis=1).astype(np.float32)
+    for level in (0, 7):  # the sequential encoding and edgebreaker
+        data = DracoPy.encode(points, faces, compression_level=level)
+        for stated, fits in ((len(faces), True), (12, False)):
+            tree = gltf()
+            tree["meshes"][0]["primitives"][0]["extensions"] = {load.DRACO: {"bufferView": 0, "attributes": {"POSITION": 0}}}
+            tree["accessors"] = [
+                {"componentType": 5126, "count": len(points), "type": "VEC3"},
+                {"componentType": 5125, "count": 3 * stated, "type": "SCALAR"},
+            ]
+            tree["bufferViews"] = [{"buffer": 0, "byteLength": len(data)}]
+            tree["buffers"] = [{"byteLength": len(data)}]
+            (tmp_path / "a.glb").write_bytes(glb(tree, data + bytes(-len(data) % 4)))
+            if fits:
+                assert len(load.load_mesh(tmp_path / "a.glb", tmp_path, **LIMITS).faces) == len(faces)
+            else:
+                with pytest.raises(Reject, match=f"unreadable: Draco data of {len(faces)} faces where 12 are stated"):
+                    load.load_mesh(tmp_path / "a.glb", tmp_path, **LIMITS)
+
+
 def test_real_files_are_taken_as_their_readme_expects(shared_data: Path) -> None:
     root = shared_data / "meshes"
     refused = {

@@ -14,7 +14,7 @@ from pipeline.config import parse
 from pipeline.errors import Reject
 from pipeline.stage import Item
 from stages.geometry import decimator, measure, remesher
-from stages.geometry.load import normalise
+from stages.geometry.load import load_mesh, normalise
 from stages.geometry.procedural import FAMILIES, box, join, moved, quads, superellipsoid
 from stages.geometry.rungs import load_rungs, rung_faces
 from stages.records import MeshRecord
@@ -141,12 +141,16 @@ def test_measures_of_known_shapes() -> None:
     assert measure.min_angle_deg(triangle, np.array([[0, 1, 2]]))[0] == pytest.approx(45)
 
 
+def qslim(mesh: tuple[np.ndarray, np.ndarray], budget: int) -> tuple[np.ndarray, np.ndarray]:
+    return decimator.collapse(*mesh, budget, "pymeshlab", 0.003)
+
+
 def test_ladder_is_on_budget_watertight_and_close() -> None:
     mesh = superellipsoid(np.random.default_rng(1))
     vertices = normalise(mesh[0]).astype(float)
-    gates = decimator.Gates(measure.Reference(vertices, mesh[1]), 0.02, 0.0, 0.01)
+    gates = decimator.Gates(measure.Reference(vertices, mesh[1]), {"distance": 0.02, "flipped": 0.01, "slivers": 0.05})
     budgets = [64, 100, 301, 512]
-    rungs = decimator.ladder([lambda: remesher.remesh(vertices, mesh[1], GRID)], budgets, "pymeshlab", gates)
+    rungs = decimator.ladder([lambda: remesher.remesh(vertices, mesh[1], GRID)], budgets, [qslim], gates, 0.5)
     assert sorted(rungs) == budgets
     for budget, rung in rungs.items():
         assert budget - 3 <= len(rung.faces) <= budget and rung.measures["watertight"] and rung.measures["flipped"] <= 0.01
@@ -154,24 +158,85 @@ def test_ladder_is_on_budget_watertight_and_close() -> None:
     assert rungs[512].measures["area_spread"] < 0.7
 
 
+def test_collapse_forgets_the_call_before() -> None:
+    """pymeshlab keeps the parameters of a process's last call as defaults."""
+    mesh = remesher.remesh(*sphere(), 32)
+    first = decimator.collapse(*mesh, 300, "pymeshlab", 0.001)
+    other = decimator.collapse(*mesh, 300, "pymeshlab", 0.1)
+    again = decimator.collapse(*mesh, 300, "pymeshlab", 0.001)
+    assert not np.array_equal(first[0], other[0])
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+def test_first_reduction_is_watertight_or_none() -> None:
+    mesh = remesher.remesh(*sphere(), GRID)
+    nearer = decimator.brought_nearer(*mesh, 4000)
+    assert len(nearer[1]) <= 4000 < len(mesh[1]) and measure.watertight(nearer[1], len(nearer[0]))
+    open_mesh = mesh[0], mesh[1][len(mesh[1]) // 2 :]
+    assert decimator.brought_nearer(*open_mesh, 4000)[1] is open_mesh[1]
+    assert decimator.brought_nearer(*mesh, 10**6)[1] is mesh[1]
+
+
+def test_gates_refuse_what_they_name() -> None:
+    cube = box((1, 1, 1))
+    reference = measure.Reference(*cube)
+    assert decimator.Gates(reference, {"distance": 0.01, "crossing": 0.0, "slivers": 0.0}, {"kept": 0.99})(cube, 16)
+    assert measure.crossing(*cube) == 0
+    through = join(box((1, 1, 1)), moved(box((0.3, 0.3, 1.2)), (0.1, 0.05, 0)))
+    needle = join(box((1, 1, 1)), moved(box((0.001, 0.001, 1)), (0.5, 0.5, 0)))
+    inward = join(box((1, 1, 1)), (box((0.5, 0.5, 0.5))[0], box((0.5, 0.5, 0.5))[1][:, ::-1]))
+    for mesh, most, said in (
+        (through, {"crossing": 0.05}, "crossing"),
+        (needle, {"slivers": 0.05}, "slivers"),
+        (box((1, 1, 1.5)), {"distance": 0.01}, "distance"),
+        (inward, {}, "collapsed"),
+        ((cube[0], cube[1][1:]), {}, "not watertight"),
+        ((cube[0], np.repeat(cube[1], 9, axis=0)), {}, "faces"),
+    ):
+        gates = decimator.Gates(reference, most)
+        assert gates(mesh, 100) is None and said in gates.refused[100]
+    small = decimator.Gates(reference, {}, least={"kept": 2.0}, least_coarse={"kept": 0.5})
+    assert small(cube, 128) is not None and small(cube, 256) is None and "kept" in small.refused[256]
+
+
 def test_ladder_tries_the_next_source_and_leaves_out_what_stays_bad() -> None:
     asked = []
 
     def gates(mesh: tuple[np.ndarray, np.ndarray], budget: int) -> decimator.Rung | None:
         asked.append(budget)
-        return decimator.Rung(*mesh, {}) if budget == 200 or (budget == 100 and len(mesh[1]) == 16) else None
+        return decimator.Rung(*mesh, {"area_spread": 1.0}) if budget == 200 or (budget == 100 and len(mesh[1]) == 16) else None
 
     sources = [lambda: sphere(), lambda: None, lambda: box((1, 1, 1))]
-    rungs = decimator.ladder(sources, [10, 100, 200], "pymeshlab", gates)
+    rungs = decimator.ladder(sources, [10, 100, 200], [qslim], gates, 0.5)
     assert sorted(rungs) == [100, 200] and len(rungs[100].faces) == 16
     assert asked == [200, 100, 10, 100, 10]  # the second time only what was missing
+
+
+def test_ladder_takes_the_first_even_rung_else_the_evenest() -> None:
+    fine, asked = sphere(), []
+
+    def reducer(name: str) -> object:
+        def reduce(mesh: tuple[np.ndarray, np.ndarray], budget: int) -> tuple[np.ndarray, np.ndarray]:
+            asked.append((budget, name, mesh[0] is fine[0]))
+            return mesh if budget > 400 else box((1, 1, 1)) if name == "close" else box((1, 1, 2))
+
+        return reduce
+
+    def gates(mesh: tuple[np.ndarray, np.ndarray], budget: int) -> decimator.Rung | None:
+        spread = {(400, 1.0): 0.4, (300, 1.0): 0.9, (300, 2.0): 0.7, (200, 1.0): 0.6, (200, 2.0): 0.8}
+        return decimator.Rung(*mesh, {"area_spread": spread[budget, np.ptp(mesh[0][:, 2])]})
+
+    rungs = decimator.ladder([lambda: fine], [200, 300, 400], [reducer("close"), reducer("even")], gates, 0.5)
+    assert {b: np.ptp(rung.vertices[:, 2]) for b, rung in rungs.items()} == {400: 1, 300: 2, 200: 1}
+    assert asked.pop(0) == (800, "close", True)  # the way to twice the largest budget is gone once
+    assert [a[:2] for a in asked] == [(400, "close"), (300, "close"), (300, "even"), (200, "close"), (200, "even")]
 
 
 @pytest.mark.parametrize("method", ["pymeshlab", "fast_simplification"])
 def test_both_methods_reduce(method: str) -> None:
     mesh = remesher.remesh(*sphere(), 32)
-    assert len(decimator.collapse(*mesh, 300, method)[1]) <= 320
-    assert decimator.collapse(*box((1, 1, 1)), 64, method)[1].shape == (16, 3)
+    assert len(decimator.collapse(*mesh, 300, method, 0.003)[1]) <= 320
+    assert decimator.collapse(*box((1, 1, 1)), 64, method, 0.003)[1].shape == (16, 3)
 
 
 # -- the stages
@@ -247,9 +312,31 @@ def test_stages_hand_on_the_catalogue(tmp_path: Path) -> None:
     assert draft.notes["summary"]["rung_300"]["objects"] == 6
 
 
+@pytest.mark.parametrize("name", ["scans/plane_holes.obj", "dungeon/keg.gltf.glb", "market/guitar.gltf", "odd/multibody.stl"])
+def test_real_meshes_through_both_stages(name: str, shared_data: Path, tmp_path: Path) -> None:
+    root = shared_data / "meshes"
+    mesh = load_mesh(root / name, root, 1 << 28, 2_000_000)
+    meta = {"object_id": "a", "content_hash": "0", "family": "", "source": "", "origin": "", "licence": "", "kept": 1.0}
+    record = MeshRecord("a", normalise(mesh.vertices), mesh.faces.astype(np.int32), meta).to_record()
+    (tmp_path / "collect").mkdir()
+    inputs = {"collect": FakeArtifact({"a": record}, tmp_path / "collect")}
+    remesh, decimate = Remesh(), Decimate()
+    config = parse(Remesh.Config, {"resolution": 96}, "remesh")
+    (fine,) = remesh.process(remesh.open(config, inputs, {}), Item("a"))
+    inputs["remesh"] = FakeArtifact({"a": fine}, tmp_path / "collect")
+    config = parse(Decimate.Config, {"budgets": [512, 1024], "coarser": []}, "decimate")
+    (result,) = decimate.process(decimate.open(config, inputs, {}), Item("a"))
+    stated = MeshRecord.from_record(fine).meta
+    assert stated["watertight"] and stated["distance"] < 0.008 and stated["kept"] > 0.65
+    vertices, faces = load_rungs(result)[1024]
+    assert len(faces) == 1024 and measure.watertight(faces, len(vertices))
+    rung = json.loads(result.members["meta.json"])["rungs"]["1024"]
+    assert rung["distance"] < 0.01 and rung["flipped"] < 0.01 and rung["crossing"] < 0.05 and rung["slivers"] < 0.05
+
+
 def test_gates_reject_with_a_reason(tmp_path: Path) -> None:
     vertices, faces = FAMILIES["tree"](np.random.default_rng(0))
-    meta = {"object_id": "a", "content_hash": "0", "family": "", "source": "", "origin": "", "licence": ""}
+    meta = {"object_id": "a", "content_hash": "0", "family": "", "source": "", "origin": "", "licence": "", "kept": 1.0}
     record = MeshRecord("a", normalise(vertices), faces.astype(np.int32), meta).to_record()
     inputs = {"collect": FakeArtifact({"a": record}, tmp_path), "remesh": FakeArtifact({"a": record}, tmp_path)}
     stage = Decimate()
@@ -258,7 +345,15 @@ def test_gates_reject_with_a_reason(tmp_path: Path) -> None:
         list(stage.process(stage.open(config, inputs, {}), Item("a")))
     assert caught.value.reason in Decimate.reasons
     remesh = Remesh()
-    config = parse(Remesh.Config, {"resolution": 16, "min_kept": 1.0}, "remesh")
-    with pytest.raises(Reject) as caught:
-        list(remesh.process(remesh.open(config, inputs, {}), Item("a")))
-    assert caught.value.reason in Remesh.reasons
+    apart = [moved(box((0.1, 0.1, 0.1)), (x, 0, 0)) for x in np.linspace(-0.45, 0.45, 4)]
+    pieces = MeshRecord(
+        "a", *(part.astype(kind) for part, kind in zip(join(*apart), (np.float32, np.int32), strict=True)), meta
+    )
+    for given, settings, reason in (
+        (record, {"min_kept": 1.0}, "lost"),
+        (pieces.to_record(), {"max_components": 3}, "scattered"),
+    ):
+        config = parse(Remesh.Config, {"resolution": 24, **settings}, "remesh")
+        with pytest.raises(Reject) as caught:
+            list(remesh.process(remesh.open(config, {"collect": FakeArtifact({"a": given}, tmp_path)}, {}), Item("a")))
+        assert caught.value.reason == reason and reason in Remesh.reasons
