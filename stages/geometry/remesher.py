@@ -12,6 +12,8 @@ work; lengths are in voxels unless said.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from pipeline.errors import Reject
@@ -207,16 +209,18 @@ def pull_back(
     gap = smooth(np.where(behind, sheet_gap, solid_gap), triangles)
     step = np.where(away < eps + 0.75, np.maximum(away - gap, 0), 0)  # farther ones are the lid of a cavity
     before = measure.face_vectors(surface, triangles)
-    before /= np.maximum(np.linalg.norm(before, axis=1, keepdims=True), 1e-300)
+    length = np.linalg.norm(before, axis=1)
+    normals = before / np.maximum(length, 1e-300)[:, None]
     share = np.ones(len(surface))
-    for _ in range(6):
+    for attempt in itertools.count():
         moved = surface + (share * step)[:, None] * direction
         after = measure.face_vectors(moved, triangles)
-        flipped = np.einsum("ij,ij->i", after, before) <= 0.1 * np.linalg.norm(after, axis=1)
-        if not flipped.any():
-            break
-        share[np.unique(triangles[flipped])] *= 0.6
-    return moved
+        # neither turned over nor, seen along the normal that it had, shrunk to almost nothing
+        along = np.einsum("ij,ij->i", after, normals)
+        bad = along <= np.maximum(0.1 * np.linalg.norm(after, axis=1), 0.02 * length)
+        if not bad.any():
+            return moved
+        share[np.unique(triangles[bad])] *= 0.6 if attempt < 6 else 0  # ends: an unmoved triangle is not bad
 
 
 def smooth(gap: np.ndarray, triangles: np.ndarray) -> np.ndarray:
