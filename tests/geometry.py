@@ -193,8 +193,13 @@ def report(results: dict, grid: int, sheet_path: Path | None, artifacts: tuple[A
             }
             bad += sum(not good for good in checks.values())
             print(f"{'':<14} bar: " + "; ".join(f"{text} {'ok' if good else 'MISSED'}" for text, good in checks.items()))
-    worst = sorted(results, key=lambda id: -max(r["distance"] + (1 - r["kept"]) / 10 for r in results[id].values()))[:10]
-    print("\nworst ten, by distance + a tenth of what is lost, over all of their meshes")
+
+    def badness(id: str) -> float:
+        finer = [r for kind, r in results[id].items() if kind == "remeshed" or int(kind) >= 256]
+        return max(r["distance"] + (1 - r["kept"]) / 10 for r in finer)
+
+    worst = sorted(results, key=badness, reverse=True)[:10]
+    print("\nworst ten, by distance + a tenth of what is lost, among remeshed and rungs from 256 faces on")
     for id in worst:
         print(id)
         for kind, r in results[id].items():

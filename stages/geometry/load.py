@@ -133,8 +133,8 @@ def _parse(data: bytes, kind: str) -> tuple[np.ndarray, np.ndarray, int]:
 
     options: dict[str, Any] = {"skip_materials": True} if kind == ".obj" else {}
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind[1:], process=False, resolver=_Nothing(), **options)
-    vertices, faces, start, parts = [], [], 0, 0
-    for name in sorted(scene.graph.nodes_geometry):
+    parts = []
+    for name in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[name]
         mesh = scene.geometry[geometry]
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
@@ -147,13 +147,14 @@ def _parse(data: bytes, kind: str) -> tuple[np.ndarray, np.ndarray, int]:
             points = points @ transform[:3, :3].T + transform[:3, 3]
         if np.linalg.det(transform[:3, :3]) < 0:  # a mirrored node turns its faces inside out
             triangles = triangles[:, ::-1]
-        vertices.append(points)
-        faces.append(triangles + start)
-        start += len(points)
-        parts += 1
+        parts.append((points, triangles))
     if not parts:
         raise Reject("no_faces", "no part of it has a triangle")
-    return np.concatenate(vertices), np.concatenate(faces), parts
+    # by content: trimesh makes up names for unnamed nodes, other ones at each call
+    parts.sort(key=lambda part: (part[0].tobytes(), part[1].tobytes()))
+    starts = np.cumsum([0, *(len(points) for points, _ in parts[:-1])])
+    faces = [triangles + start for (_, triangles), start in zip(parts, starts, strict=True)]
+    return np.concatenate([points for points, _ in parts]), np.concatenate(faces), len(parts)
 
 
 class _Nothing:

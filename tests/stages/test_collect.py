@@ -234,6 +234,20 @@ def test_scene_graph_is_flattened_and_mirrored_parts_stay_outward(tmp_path: Path
     assert mesh.vertices[:, 0].max() == pytest.approx(2 * 16)
 
 
+def test_parts_come_in_the_same_order_every_time(tmp_path: Path) -> None:
+    """trimesh puts random letters into the names of nodes whose mesh has several primitives."""
+    primitives = [{"attributes": {"POSITION": 0}, "indices": index} for index in (1, 2)]
+    nodes = [{"mesh": 0, "name": "part", "translation": [x, 0, 0]} for x in range(6)]
+    tree = gltf(nodes=nodes, scenes=[{"nodes": list(range(6))}], meshes=[{"primitives": primitives}])
+    tree["accessors"].append({**tree["accessors"][1], "count": 18})
+    (tmp_path / "a.gltf").write_bytes(json.dumps(tree).encode())
+    first = load.load_mesh(tmp_path / "a.gltf", tmp_path, **LIMITS)
+    assert first.parts == 12
+    for _ in range(5):
+        again = load.load_mesh(tmp_path / "a.gltf", tmp_path, **LIMITS)
+        assert np.array_equal(first.vertices, again.vertices) and np.array_equal(first.faces, again.faces)
+
+
 def test_draco_without_its_decoder_is_refused_by_name(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = shared_data / "meshes" / "market"
     assert len(load.load_mesh(root / "barrel.gltf", root, **LIMITS).faces) == 306
