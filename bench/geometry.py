@@ -86,10 +86,15 @@ def sources(path: str | None, limit: int | None) -> list[tuple[str, Callable[[],
         for family, make in FAMILIES.items():
             for number in range(2):
                 made.append((f"{family}-{number}", functools.partial(_procedural, make, number)))
-        return made[:limit]
+        return made[:: _stride(made, limit)]
     root = Path(path)
     files = [file for file in sorted(root.rglob("*")) if file.suffix.lower() in load.SUFFIXES]
-    return [(str(file), functools.partial(load.load_mesh, file, root, 1 << 28, 2_000_000)) for file in files][:limit]
+    files = files[:: _stride(files, limit)]
+    return [(str(file), functools.partial(load.load_mesh, file, root, 1 << 28, 2_000_000)) for file in files]
+
+
+def _stride(items: list, limit: int | None) -> int:
+    return max(1, -(-len(items) // limit)) if limit else 1
 
 
 def _procedural(make: Callable, seed: int) -> load.Loaded:
@@ -229,7 +234,7 @@ def main() -> None:
     parser.add_argument("--path", help="folder of meshes (default: procedural ones)")
     parser.add_argument("--grids", default="64,128,256")
     parser.add_argument("--decimators", action="store_true", help="compare decimators instead, at grid 128")
-    parser.add_argument("--limit", type=int, help="only the first so many meshes")
+    parser.add_argument("--limit", type=int, help="at most so many meshes, evenly spread")
     arguments = parser.parse_args()
     context = multiprocessing.get_context("spawn")
     if arguments.decimators:
