@@ -138,7 +138,7 @@ def assemble(
             diffuse=np.ones((1, 3)),  # as the released format has it; nothing reflects from a light
             specular=np.zeros((1, 3)),
             roughness=np.ones(1),
-            emission=np.full((1, 3), light.radiance),
+            emission=light.radiance * np.array([light.tint]),
             light_index=np.array([number]),
         )
     for entry, extra in zip((d for d in described if d["kind"] == "object"), origins, strict=True):

@@ -18,14 +18,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from pipeline.config import Section
+from pipeline.errors import UserError
 
 Range = tuple[float, float]  # uniform between the two
+Share = Annotated[float, Field(ge=0, le=1)]
 
 WALLS = {"floor": 2, "back": 1, "right": 0, "left": 0}  # wall -> axis of its normal
 TEMPLATES = {
@@ -120,7 +122,10 @@ class MaterialLaw(Section):
 
 
 class LightLaw(Section):
-    """Lights are single white triangles, in scene units."""
+    """Lights are single triangles, in scene units: white, small and outside, as in the paper, unless a share says otherwise.
+
+    ``count`` may go beyond eight, with a smaller ``separation``.
+    """
 
     count: tuple[int, int] = (1, 8)
     radiance: Range = (2500.0, 5000.0)  # of each light, divided by their number
@@ -131,10 +136,18 @@ class LightLaw(Section):
     distance: Range = (2.1, 2.7)  # from the target, after moving outwards
     target: Range = (-0.2, 0.2)  # per axis
     box_cap_deg: float = 60.0
+    # beyond the paper (its section 4.2 names each as a limit of its data); share 0: never
+    coloured_share: Share = 0.0  # of the lights
+    tint: Range = (0.1, 1.0)  # per channel of a coloured light, the largest then raised to 1
+    large_share: Share = 0.0
+    large_scale: Range = (4.0, 10.0)  # instead of scale; the power stays about the same
+    inside_share: Share = 0.0
+    inside: Range = (-0.45, 0.45)  # position of a light inside, per axis
+    inside_dimming: Range = (0.01, 0.05)  # its radiance over that of a light outside
 
 
 class CameraLaw(Section):
-    """Cameras look at a point near the origin from outside, in scene units."""
+    """Cameras look at a point near the origin, in scene units: from outside, as in the paper, unless a share says otherwise."""
 
     views: int = 4
     distance: Range = (1.5, 2.0)  # from the look-at point
@@ -144,6 +157,11 @@ class CameraLaw(Section):
     shell_radius: float = 0.866
     box_y: float = -3.0  # box: start from a square in front at this y ...
     box_square: Range = (-1.0, 1.0)  # ... and these x and z
+    # beyond the paper
+    inside_share: Share = 0.0
+    inside: Range = (-0.45, 0.45)  # position of a camera inside, per axis
+    inside_distance: float = 0.3  # least distance to its look-at point
+    inside_fov_deg: Range = (50.0, 90.0)
 
 
 @dataclass
@@ -181,6 +199,8 @@ class Light:
     rotation_deg: list[float]
     scale: list[float]
     radiance: float
+    tint: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])  # RGB factor of the radiance
+    inside: bool = False  # position was drawn inside; shell, target and distance did not decide it
 
 
 @dataclass
@@ -191,6 +211,7 @@ class Camera:
     position: list[float]
     up: list[float]
     fov_deg: float
+    inside: bool = False  # as of a light
 
 
 @dataclass
@@ -229,7 +250,42 @@ def draw_plan(laws: Laws, rng: np.random.Generator, n_objects: int) -> Plan:
     _draw_objects(laws, rng, plan, n_objects)
     plan.lights = draw_lights(laws.lights, rng, template)
     plan.cameras = [draw_camera(laws.cameras, rng, template) for _ in range(laws.cameras.views)]
+    # generators of their own: what goes beyond the paper leaves the rest of a scene as it was
+    beyond_lights, beyond_cameras = rng.spawn(2)
+    for light in plan.lights:
+        _vary_light(laws.lights, beyond_lights, light)
+    for camera in plan.cameras:
+        _vary_camera(laws.cameras, beyond_cameras, camera)
     return plan
+
+
+def _vary_light(law: LightLaw, rng: np.random.Generator, light: Light) -> None:
+    """Colour, size and place beyond the paper; every light takes the same number of draws."""
+    coloured, large, inside = rng.random(3) < (law.coloured_share, law.large_share, law.inside_share)
+    tint, scale = rng.uniform(*law.tint, size=3), rng.uniform(*law.large_scale, size=3)
+    position, dimming = rng.uniform(*law.inside, size=3), float(rng.uniform(*law.inside_dimming))
+    if coloured:
+        light.tint = (tint / tint.max()).tolist()
+    if large:
+        light.radiance *= float((np.mean(light.scale) / scale.mean()) ** 2)
+        light.scale = scale.tolist()
+    if inside:
+        light.inside, light.position = True, position.tolist()
+        light.radiance *= dimming
+
+
+def _vary_camera(law: CameraLaw, rng: np.random.Generator, camera: Camera) -> None:
+    """A place inside, beyond the paper."""
+    if rng.random() >= law.inside_share:
+        return
+    for _ in range(1000):
+        position = rng.uniform(*law.inside, size=3)
+        distance = float(np.linalg.norm(position - camera.look_at))
+        if distance >= law.inside_distance:
+            camera.inside, camera.position, camera.distance = True, position.tolist(), distance
+            camera.fov_deg = float(rng.uniform(*law.inside_fov_deg))
+            return
+    raise ValueError(f"no camera in {law.inside} per axis is {law.inside_distance} away from its look-at point")
 
 
 def _draw_wall(laws: Laws, rng: np.random.Generator, template: str, wall: str, patch: bool) -> Placement:
@@ -339,7 +395,10 @@ def _separated(law: LightLaw, rng: np.random.Generator, template: str, count: in
                 points.append(point)
                 if len(points) == count:
                     return points
-    raise ValueError(f"{count} lights {law.separation} apart do not fit on the {template} template's shell")
+    raise UserError(
+        f"{count} lights {law.separation} apart do not fit on the {template} template's shell: lower scene.lights.separation "
+        "(0.2 holds 16) or scene.lights.count"
+    )
 
 
 def _light_allowed(law: LightLaw, template: str, d: np.ndarray) -> bool:

@@ -171,6 +171,46 @@ def test_lights(plans):
     uniform([p.lights[0].shell[2] / 0.866 for p in released if p.template in ("floor", "wall")], 0, 1)
 
 
+def test_beyond_the_paper_changes_nothing_else(plans):
+    everything = config_of(
+        "released",
+        lights={"coloured_share": 0.5, "large_share": 0.25, "inside_share": 0.3},
+        cameras={"inside_share": 0.4},
+    ).laws()
+    beyond = [draw_plan(everything, np.random.default_rng(i), 50) for i in range(N)]
+    pairs = [
+        (a, b)
+        for before, after in zip(plans["released"], beyond, strict=True)
+        for a, b in zip(before.lights, after.lights, strict=True)
+    ]
+    for before, after in zip(plans["released"], beyond, strict=True):
+        assert (before.walls, before.objects, before.template) == (after.walls, after.objects, after.template)
+    lights = [b for _, b in pairs]
+    large = [b for a, b in pairs if a.scale != b.scale]
+    coloured = [b for b in lights if b.tint != [1, 1, 1]]
+    inside = [(a, b) for a, b in pairs if b.inside]
+    for hits, expected in ((coloured, 0.5), (large, 0.25), (inside, 0.3)):
+        share(len(hits), len(lights), expected)
+    assert all(max(b.tint) == 1 and min(b.tint) >= 0.1 for b in coloured)
+    uniform([b.scale for b in large], 4, 10)
+    uniform([b.position for _, b in inside], -0.45, 0.45)
+    uniform([b.radiance / a.radiance for a, b in inside if a.scale == b.scale], 0.01, 0.05)
+    assert all(a == b for a, b in pairs if not b.inside and b.tint == [1, 1, 1] and a.scale == b.scale)
+    cameras = [c for plan in beyond for c in plan.cameras]
+    within = [c for c in cameras if c.inside]
+    share(len(within), len(cameras), 0.4)
+    uniform([c.fov_deg for c in within], 50, 90)
+    for c in within:
+        assert max(map(abs, c.position)) <= 0.45
+        assert np.linalg.norm(np.subtract(c.position, c.look_at)) == pytest.approx(c.distance) and c.distance >= 0.3
+
+
+def test_more_than_eight_lights():
+    law = config_of("released", lights={"count": [12, 16], "separation": 0.2}).laws()
+    plans = [draw_plan(law, np.random.default_rng(i), 50) for i in range(20)]
+    assert {len(plan.lights) for plan in plans} <= set(range(12, 17)) and {plan.template for plan in plans} >= {"box", "floor"}
+
+
 def test_light_triangle():
     edges = np.linalg.norm(meshes.LIGHT_TRIANGLE - np.roll(meshes.LIGHT_TRIANGLE, 1, axis=0), axis=1)
     area = np.linalg.norm(np.cross(*(meshes.LIGHT_TRIANGLE[1:] - meshes.LIGHT_TRIANGLE[0]))) / 2
@@ -294,7 +334,7 @@ def test_refusals(made, tmp_path):
     small = config_of("released", max_triangles=200, weights={name: 0 for name in dict(config.weights)} | {"wall_single": 1})
     with pytest.raises(Reject, match="over_budget"):
         next(iter(stage.process(stage.open(small, inputs, {}), Item("train-000000", "train"))))
-    with pytest.raises(ValueError, match="do not fit"):
+    with pytest.raises(UserError, match="do not fit.*separation"):
         from stages.scenes.laws import draw_lights
 
         draw_lights(LightLaw(count=(8, 8), separation=1.7), np.random.default_rng(0), "floor")
