@@ -252,7 +252,7 @@ def add_commands(parsers: Any, program: str) -> None:
     parser = add("show", command_show, "show one artifact: config, counts, rejects, summary, lineage", "render")
     parser.add_argument("artifact", help="a key or its beginning, stage/folder, or a stage's name for its newest")
     parser.add_argument("--rejects", type=int, default=10, help="how many rejects to list (default: 10)")
-    parser = add("why", command_why, "say which parameter makes a stage run again", "render render.spp=64")
+    parser = add("why", command_why, "say which parameter makes a stage run again", "render render.max_spp=64")
     parser.add_argument("words", nargs="+", help="a stage and config overrides, or two artifacts to compare")
     parser = add("verify", command_verify, "check artifacts against their manifests", "--deep")
     parser.add_argument("artifacts", nargs="*", help="which (default: all)")

@@ -120,7 +120,7 @@ class SceneWorker:
 
 class SampleScene(MapStage):
     name = "scene"
-    version = 1
+    version = 2
     inputs = ("decimate",)
     Config = SceneConfig
     reasons = {"over_budget": "walls, lights and the smallest rungs of the objects exceed max_triangles"}

@@ -28,7 +28,8 @@ SHEET_SCENES = 12  # rows of a contact sheet
 class RenderConfig(StageConfig):
     seed: int = 0
     resolution: int = Field(64, ge=8, le=4096)  # pixels per side; the paper: 256, then 512
-    spp: int = Field(16, ge=1, le=65536)  # camera paths per pixel, shared by all lights
+    target_error: float = Field(0.002, ge=0)  # of the stored image, mean absolute log10(1 + x), estimated; 0: max_spp at once
+    max_spp: int = Field(16, ge=1, le=65536)  # camera paths per pixel, shared by all lights, at most
     mode: Literal["physical", "cycles"] = "physical"  # cycles: Blender Cycles' defaults, as far as they can be matched
     max_depth: int = Field(34, ge=2)  # longest path in segments: 34 is 32 bounces besides direct light
     denoise: bool = True  # Open Image Denoise, every light on its own
@@ -47,7 +48,7 @@ class RenderWorker:
 
 class Render(MapStage):
     name = "render"
-    version = 1
+    version = 2
     inputs = ("scene",)
     Config = RenderConfig
     reasons = {
@@ -57,7 +58,7 @@ class Render(MapStage):
     }
 
     def slug(self, config: RenderConfig) -> str:
-        return f"{config.mode}-{config.resolution}px-{config.spp}spp"
+        return f"{config.mode}-{config.resolution}px-{config.max_spp}spp"
 
     def part_size(self, config: RenderConfig) -> int:
         return 4
@@ -84,7 +85,8 @@ class Render(MapStage):
         views = render_views(
             SceneRecord.from_record(worker.scenes.read(item.id)),
             config.resolution,
-            spp=config.spp,
+            max_spp=config.max_spp,
+            target_error=config.target_error,
             seed=seed_for(config.seed, self.name, item.id),
             backend=worker.backend,
             mode=config.mode,

@@ -43,7 +43,7 @@ def trace(
         record = render_views(
             scene,
             resolution,
-            spp=spp,
+            max_spp=spp,
             seed=seed,
             backend=chosen,
             views=[index],

@@ -22,7 +22,7 @@ from pipeline.store import Store
 
 ROOT = Path(__file__).resolve().parents[1]
 STAGES = ("collect", "remesh", "decimate", "scene", "render", "shard")
-SMALL = ("collect.per_family=1", "scene.count.train=24", "scene.count.validation=4", "scene.count.test=4", "render.spp=4")
+SMALL = ("collect.per_family=1", "scene.count.train=24", "scene.count.validation=4", "scene.count.test=4", "render.max_spp=4")
 
 
 def start(stage: str, store: Path, overrides: list[str]) -> subprocess.Popen:

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SMALL = [
     "collect.per_family=1", "remesh.resolution=48", "decimate.budgets=[64,128]",
     "scene.count.train=8", "scene.count.validation=2", "scene.count.test=3", "scene.cameras.views=2",
-    "render.resolution=32", "render.spp=2", "shard.scenes_per_shard=4",
+    "render.resolution=32", "render.max_spp=2", "shard.scenes_per_shard=4",
     "train.steps=3", "train.batch_scenes=2", "train.views_per_scene=2", "train.warmup=1",
 ]  # fmt: skip
 
@@ -58,15 +58,15 @@ def test_second_run_computes_nothing(first, folder):
 
 
 def test_a_change_reruns_its_stage_and_what_follows(first, folder):
-    plan = run(folder, "stage=evaluate", "plan=true", "render.spp=3")
+    plan = run(folder, "stage=evaluate", "plan=true", "render.max_spp=3")
     states = {line.split()[1]: line.split(None, 2)[2] for line in plan.splitlines() if line[:2].isdigit()}
     assert [name for name, state in states.items() if state.startswith("up to date")] == [
         "collect", "remesh", "decimate", "scene",
     ]  # fmt: skip
     assert [name for name, state in states.items() if state.startswith("to make")] == ["render", "shard", "train", "evaluate"]
-    command = [sys.executable, "-m", "stages.cli", "why", "--store", f"{folder}/store", "render", *SMALL, "render.spp=3"]
+    command = [sys.executable, "-m", "stages.cli", "why", "--store", f"{folder}/store", "render", *SMALL, "render.max_spp=3"]
     why = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert "render.spp: 2 -> 3" in why
+    assert "render.max_spp: 2 -> 3" in why
 
 
 def test_more_scenes_render_only_the_new_ones(first, folder):

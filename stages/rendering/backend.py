@@ -163,7 +163,7 @@ def _trial(backend: dict[str, Any]) -> None:
         camera[None],
         np.float32([60]),
     )
-    mean = float(render_views(scene, 8, spp=4, seed=0, backend=backend, denoise=False)[0].image.mean())
+    mean = float(render_views(scene, 8, max_spp=4, seed=0, backend=backend, denoise=False)[0].image.mean())
     assert np.isfinite(mean) and mean > 0, mean
 
 

@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from stages.records import SceneRecord
+from stages.rendering.layers import Sums
 from stages.rendering.surfaces import face_normals, surface_mesh
 
 SLOTS = 8  # lights per pass; more lights take several passes of the same kernel
@@ -39,19 +40,6 @@ class Limits:
     glossy_bounces: int = 1 << 20
     indirect_clamp: float = float("inf")  # bound on the mean over RGB of one indirect contribution, after Cycles
     filter: str = "box"
-
-
-@dataclass
-class Layers:
-    """Pixel means of one view, see ViewRecord; ``nearest`` is any sample's smallest distance (inf: nothing hit)."""
-
-    lights: np.ndarray
-    direct: np.ndarray
-    albedo: np.ndarray
-    normal: np.ndarray
-    depth: np.ndarray
-    coverage: np.ndarray
-    nearest: float
 
 
 def filter_offsets(name: str) -> np.ndarray:
@@ -242,42 +230,37 @@ class JitRenderer:
         self.albedo = _floats(np.where(emits, 0, scene.diffuse + scene.specular))
         self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
 
-    def render(
-        self, resolution: int, spp: int, seed: int, views: list[int], limits: Limits, lights_visible: bool
-    ) -> list[Layers]:
-        """Layers of each view, from ``spp`` paths per pixel that serve all lights together."""
+    def sample(
+        self, resolution: int, first: int, spp: int, seed: int, views: list[int], limits: Limits, lights_visible: bool
+    ) -> list[Sums]:
+        """Sums of each view over the samples ``first`` to ``first + spp`` of every pixel; a path serves all lights."""
         pixels = resolution * resolution
         ids = np.concatenate([view * pixels + np.arange(pixels) for view in views]).astype(np.uint32)
-        sums = [
-            self._pass(table, number, ids, resolution, spp, seed, limits, lights_visible)
+        passes = [
+            self._pass(table, number, ids, resolution, first, spp, seed, limits, lights_visible)
             for number, table in enumerate(self.passes)
         ]
-        lights = np.concatenate([s["lights"] for s in sums])[: self.record.n_lights] / spp
-        direct = sum(s["direct"] for s in sums) / spp
-        first = sums[0]  # the camera rays of all passes are the same
-        hits = first["coverage"]
-        layers = []
+        lights = np.concatenate([p["lights"] for p in passes])[: self.record.n_lights]
+        direct = sum(p["direct"] for p in passes)
+        hit = passes[0]  # the camera rays of all passes are the same
+        sums = []
         for index in range(len(views)):
             part = slice(index * pixels, (index + 1) * pixels)
-            shape = (resolution, resolution)
 
-            def image(values: np.ndarray, part=part, shape=shape) -> np.ndarray:
-                values = values[..., part, :].astype(np.float32)
-                return values.reshape(*values.shape[:-2], *shape, values.shape[-1])
+            def image(values: np.ndarray, part=part) -> np.ndarray:
+                values = values[..., part, :]
+                return values.reshape(*values.shape[:-2], resolution, resolution, values.shape[-1])
 
-            depth = np.where(hits > 0, first["distance"] / np.maximum(hits, 1), 0)
-            layers.append(
-                Layers(
-                    image(lights),
-                    image(direct),
-                    image(first["albedo"] / spp),
-                    image(first["normal"] / spp),
-                    image(depth)[..., 0],
-                    image(hits / spp)[..., 0],
-                    float(first["nearest"][part].min(initial=np.inf)),
+            sums.append(
+                Sums(
+                    spp,
+                    *(image(values) for values in (lights, direct, hit["albedo"], hit["normal"])),
+                    image(hit["distance"])[..., 0],
+                    image(hit["coverage"])[..., 0],
+                    float(hit["nearest"][part].min(initial=np.inf)),
                 )
             )
-        return layers
+        return sums
 
     def _pass(
         self,
@@ -285,24 +268,25 @@ class JitRenderer:
         number: int,
         ids: np.ndarray,
         resolution: int,
+        first: int,
         spp: int,
         seed: int,
         limits: Limits,
         lights_visible: bool,
     ) -> dict[str, np.ndarray]:
-        """Sums over samples, float64 (pixels, channels) each; ``lights`` (SLOTS, pixels, 3), ``nearest`` a minimum."""
+        """Sums over the samples, float64 (pixels, channels) each; ``lights`` (SLOTS, pixels, 3), ``nearest`` a minimum."""
         count = len(ids)
         widths = {"direct": 3, "albedo": 3, "normal": 3, "distance": 1, "coverage": 1}
         sums = {name: np.zeros((count, width)) for name, width in widths.items()}
         sums["lights"] = np.zeros((SLOTS, count, 3))
         sums["nearest"] = np.full((count, 1), np.inf)
         samples = min(spp, CHUNK // 64)
-        for first in range(0, spp, samples):
-            depth = min(samples, spp - first)
+        for done in range(0, spp, samples):
+            depth = min(samples, spp - done)
             rows = max(CHUNK // depth, 1)
             for start in range(0, count, rows):
                 part = slice(start, min(start + rows, count))
-                values = self._chunk(table, number, ids[part], first, depth, resolution, seed, limits, lights_visible)
+                values = self._chunk(table, number, ids[part], first + done, depth, resolution, seed, limits, lights_visible)
                 for name, value in values.items():
                     shaped = value.reshape(*value.shape[:-1], -1, depth)  # (.., channels, pixels, samples)
                     total = np.moveaxis(shaped.sum(axis=-1, dtype=np.float64), -1, -2)

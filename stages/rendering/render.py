@@ -11,7 +11,7 @@ Modes:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,11 @@ from stages.exr import clamped_values
 from stages.records import SceneRecord, ViewRecord
 from stages.rendering import backend as backends
 from stages.rendering.denoising import denoise as denoise_layer
+from stages.rendering.error import estimated_error
+from stages.rendering.layers import Sums
 
 MODES = ("physical", "cycles")
+FIRST_SPP = 16  # before the first estimate
 MIN_MEAN = 0.01  # mean radiance under which a view is dark
 MIN_DEPTH = 0.01  # nearest distance, scene units, under which a view is too close
 
@@ -31,9 +34,10 @@ def render_views(
     scene: SceneRecord,
     resolution: int,
     *,
-    spp: int,
+    max_spp: int,
     seed: int,
     backend: dict[str, Any],
+    target_error: float = 0.0,
     views: Sequence[int] | None = None,
     mode: str = "physical",
     max_depth: int = 34,
@@ -43,53 +47,86 @@ def render_views(
 ) -> list[ViewRecord]:
     """Path trace ``views`` (indices of cameras; None: all) of a scene at ``resolution`` x ``resolution`` pixels.
 
-    spp: camera paths per pixel for the image with all lights on. The JIT integrator shares each path among all lights;
-        the scalar one gives each light its share of the paths (``light_spp`` in the view's meta).
+    max_spp: camera paths per pixel for the image with all lights on, at most. The JIT integrator shares each path among all
+        lights; the scalar one gives each light its share of the paths.
+    target_error: a view gets 16 samples, and as many again as it has, until its estimated error (``stages.rendering.error``)
+        is at most this; 0: ``max_spp`` at once.
     backend: from ``stages.rendering.backend.choose``. max_depth: longest path in segments; 2 is direct light only.
     lights_visible: whether camera rays see lights (reflections always do).
     """
     if mode not in MODES:
         raise UserError(f"mode={mode!r} is unknown: choose from {', '.join(MODES)}")
     backends.activate(backend, threads)
-    views = list(range(len(scene.camera_to_world))) if views is None else list(views)
+    sample = _sampler(scene, resolution, seed, backend, mode, max_depth, lights_visible)
+    records = {}
+    active = list(range(len(scene.camera_to_world))) if views is None else list(views)
+    order, halves, taken = list(active), {}, 0
+    step = min(FIRST_SPP, max_spp) if target_error > 0 else max_spp
+    while active:
+        # two halves that share no path: what tells noise from image
+        for half, first, spp in ((0, taken, step // 2), (1, taken + step // 2, step - step // 2)):
+            for view, sums in zip(active, sample(first, spp, active) if spp else (), strict=bool(spp)):
+                before = halves.setdefault(view, [None, None])
+                before[half] = sums if before[half] is None else before[half] + sums
+        taken += step
+        left = []
+        for view in active:
+            estimate = estimated_error(*halves[view], denoised=denoise)
+            if taken < max_spp and estimate is not None and estimate > target_error:
+                left.append(view)
+            else:
+                a, b = halves.pop(view)
+                records[view] = _finish(b if a is None else a + b, view, denoise, estimate)
+        active, step = left, min(taken, max_spp - taken)
+    return [records[view] for view in order]
+
+
+def _sampler(
+    scene: SceneRecord,
+    resolution: int,
+    seed: int,
+    backend: dict[str, Any],
+    mode: str,
+    max_depth: int,
+    lights_visible: bool,
+) -> Callable[[int, int, list[int]], list[Sums]]:
+    """(first sample, samples, views) -> sums of each view."""
     if backend["backend"] == "scalar":
         if mode == "cycles":
             raise UserError("mode=cycles needs a JIT backend of Mitsuba, and none works here: " + backends.INSTALL)
         from stages.rendering.scalar import ScalarRenderer
 
-        renderer = ScalarRenderer(scene, lights_visible)
-        light_spp = renderer.light_spp(spp)
-        layers = renderer.render(resolution, spp, seed, views, max_depth)
-    else:
-        from stages.rendering.jit import JitRenderer, Limits
+        scalar = ScalarRenderer(scene, lights_visible)
+        return lambda first, spp, views: scalar.sample(resolution, first, spp, seed, views, max_depth)
+    from stages.rendering.jit import JitRenderer, Limits
 
-        light_spp = spp
-        # Cycles lets light in at the hit behind the last counted bounce, hence 12 + 1.
-        limits = (
-            Limits(max_depth - 1)
-            if mode == "physical"
-            else Limits(min(max_depth - 1, 13), 4, 4, indirect_clamp=10.0, filter="blackman-harris")
-        )
-        layers = JitRenderer(scene).render(resolution, spp, seed, views, limits, lights_visible)
+    # Cycles lets light in at the hit behind the last counted bounce, hence 12 + 1.
+    limits = (
+        Limits(max_depth - 1)
+        if mode == "physical"
+        else Limits(min(max_depth - 1, 13), 4, 4, indirect_clamp=10.0, filter="blackman-harris")
+    )
+    jit = JitRenderer(scene)
+    return lambda first, spp, views: jit.sample(resolution, first, spp, seed, views, limits, lights_visible)
 
-    records = []
-    for index, layer in zip(views, layers, strict=True):
 
-        def clean(radiance: np.ndarray, layer=layer) -> np.ndarray:
-            return denoise_layer(radiance, layer.albedo, layer.normal, layer.coverage) if denoise else radiance
+def _finish(sums: Sums, index: int, denoise: bool, error: float | None) -> ViewRecord:
+    """The stored view: every light denoised on its own, and what is to be said of it."""
+    layer = sums.layers()
 
-        lights = np.stack([clean(light) for light in layer.lights]) if len(layer.lights) else layer.lights
-        view = ViewRecord(lights, clean(layer.direct), layer.albedo, layer.normal, layer.depth, layer.coverage)
-        mean = float(view.image.mean(dtype=np.float64))
-        status = "too_close" if layer.nearest < MIN_DEPTH else "dark" if mean < MIN_MEAN else "ok"
-        view.meta = {
-            "index": int(index),
-            "status": status,
-            "mean": mean,
-            "spp": int(spp),
-            "light_spp": light_spp,
-            "clamped": clamped_values(view),
-            "nearest": layer.nearest if np.isfinite(layer.nearest) else None,
-        }
-        records.append(view)
-    return records
+    def clean(radiance: np.ndarray) -> np.ndarray:
+        return denoise_layer(radiance, layer.albedo, layer.normal, layer.coverage) if denoise else radiance
+
+    lights = np.stack([clean(light) for light in layer.lights]) if len(layer.lights) else layer.lights
+    view = ViewRecord(lights, clean(layer.direct), layer.albedo, layer.normal, layer.depth, layer.coverage)
+    mean = float(view.image.mean(dtype=np.float64))
+    view.meta = {
+        "index": int(index),
+        "status": "too_close" if layer.nearest < MIN_DEPTH else "dark" if mean < MIN_MEAN else "ok",
+        "mean": mean,
+        "spp": sums.spp,
+        "error": error,
+        "clamped": clamped_values(view),
+        "nearest": layer.nearest if np.isfinite(layer.nearest) else None,
+    }
+    return view

@@ -13,10 +13,10 @@ import mitsuba as mi
 import numpy as np
 
 from stages.records import SceneRecord
-from stages.rendering.jit import Layers
+from stages.rendering.layers import Sums
 from stages.rendering.surfaces import face_normals, mesh_of, surface_mesh
 
-MIN_SPP = 2  # per light
+MIN_SPP = 1  # per light
 GAP = 1e-5  # distance of a light's side from its true plane, over the largest coordinate of the light
 
 
@@ -46,19 +46,20 @@ class ScalarRenderer:
         first = {"surface": surface_mesh(scene, shown, albedo_only=True)} if len(shown) else {}
         self.first_hit_scene = mi.load_dict({"type": "scene", **first})
 
-    def render(self, resolution: int, spp: int, seed: int, views: list[int], max_depth: int) -> list[Layers]:
-        """Layers of each view. A light gets its share of ``spp`` paths per pixel, first hits and direct light all."""
+    def sample(self, resolution: int, first: int, spp: int, seed: int, views: list[int], max_depth: int) -> list[Sums]:
+        """Sums of each view over ``spp`` paths per pixel, the ones from ``first`` on. A light gets its share of them, first
+        hits and direct light all; a light's sum is scaled up to ``spp``."""
         count = self.record.n_lights
         share = self.light_spp(spp)
         shape = (resolution, resolution, 3)
-        lights = np.zeros((len(views), count, *shape), np.float32)
-        direct = np.zeros((len(views), *shape), np.float32)
+        lights = np.zeros((len(views), count, *shape))
+        direct = np.zeros((len(views), *shape))
         sensors = [self._sensor(view, resolution) for view in views]
 
         def trace(sensor, depth: int, samples: int, *where: int) -> np.ndarray:
             integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": not self.lights_visible})
-            image = mi.render(self.scene, sensor=sensor, integrator=integrator, spp=samples, seed=_seed(seed, *where))
-            return np.array(image, np.float32)[..., :3]
+            image = mi.render(self.scene, sensor=sensor, integrator=integrator, spp=samples, seed=_seed(seed, *where, first))
+            return np.array(image, np.float64)[..., :3] * spp
 
         for light in range(count):
             if self._switch_on([light]):
@@ -67,14 +68,13 @@ class ScalarRenderer:
         if self._switch_on(range(count)):
             for row, view in enumerate(views):
                 direct[row] = trace(sensors[row], min(2, max_depth), spp, view, count)
-        return [
-            Layers(
-                lights[row],
-                direct[row],
-                *self._first_hits(sensors[row], view, resolution, spp, _seed(seed, view, count + 1)),
-            )
-            for row, view in enumerate(views)
-        ]
+        sums = []
+        for row, view in enumerate(views):
+            hit = self._first_hits(sensors[row], view, resolution, spp, _seed(seed, view, count + 1, first))
+            albedo, normal, depth, coverage, nearest = (np.asarray(values, np.float64) for values in hit)
+            hits = coverage * spp
+            sums.append(Sums(spp, lights[row], direct[row], albedo * spp, normal * spp, depth * hits, hits, float(nearest)))
+        return sums
 
     def light_spp(self, spp: int) -> int:
         """Paths per pixel that each light gets of ``spp``."""

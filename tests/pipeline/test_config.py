@@ -49,7 +49,7 @@ def test_every_model_is_a_valid_config(model):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["render.sp=4"], "did you mean 'render.spp'"),
+        (["render.max_sp=4"], "did you mean 'render.max_spp'"),
         (["render=defalt"], "did you mean 'default'"),
         (["model=tny"], "did you mean 'tiny'"),
         (["stge=train"], "did you mean 'stage'"),
@@ -82,8 +82,8 @@ def test_command_line_accepts_the_sweep_flag_anywhere(tmp_path, flags):
 
 
 def test_error_is_one_line_with_a_status(tmp_path):
-    command = [sys.executable, "-m", "pipeline", "render.spp=many", f"store={tmp_path}"]
+    command = [sys.executable, "-m", "pipeline", "render.max_spp=many", f"store={tmp_path}"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2
-    assert done.stderr.startswith("error: render.spp='many'")
+    assert done.stderr.startswith("error: render.max_spp='many'")
     assert len(done.stderr.splitlines()) == 1
