@@ -212,15 +212,19 @@ def pull_back(
     length = np.linalg.norm(before, axis=1)
     normals = before / np.maximum(length, 1e-300)[:, None]
     share = np.ones(len(surface))
+    look = np.arange(len(triangles))  # at these faces: a corner has just moved
     for attempt in itertools.count():
         moved = surface + (share * step)[:, None] * direction
-        after = measure.face_vectors(moved, triangles)
+        after = measure.face_vectors(moved, triangles[look])
         # neither turned over nor, seen along the normal that it had, shrunk to almost nothing
-        along = np.einsum("ij,ij->i", after, normals)
-        bad = along <= np.maximum(0.1 * np.linalg.norm(after, axis=1), 0.02 * length)
+        along = np.einsum("ij,ij->i", after, normals[look])
+        bad = along <= np.maximum(0.1 * np.linalg.norm(after, axis=1), 0.02 * length[look])
         if not bad.any():
             return moved
-        share[np.unique(triangles[bad])] *= 0.6 if attempt < 6 else 0  # ends: an unmoved triangle is not bad
+        touched = np.zeros(len(surface), bool)
+        touched[triangles[look[bad]]] = True
+        share[touched] *= 0.6 if attempt < 6 else 0  # ends: an unmoved triangle is not bad
+        look = np.flatnonzero(touched[triangles].any(axis=1))
 
 
 def smooth(gap: np.ndarray, triangles: np.ndarray) -> np.ndarray:
