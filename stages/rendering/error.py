@@ -22,7 +22,7 @@ def log_error(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def estimated_error(a: Sums | None, b: Sums | None, denoised: bool) -> float | None:
-    """Of the image with all lights on from the samples of both halves; None where there is only one."""
+    """Of the image with all lights on, from the samples of both halves; None where there is only one half."""
     if a is None or b is None:
         return None
     images = []

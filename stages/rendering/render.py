@@ -50,7 +50,7 @@ def render_views(
     max_spp: camera paths per pixel for the image with all lights on, at most. The JIT integrator shares each path among all
         lights; the scalar one gives each light its share of the paths.
     target_error: a view gets 16 samples, and as many again as it has, until its estimated error (``stages.rendering.error``)
-        is at most this; 0: ``max_spp`` at once.
+        is at most this; 0: ``max_spp`` at once, and no estimate.
     backend: from ``stages.rendering.backend.choose``. max_depth: longest path in segments; 2 is direct light only.
     lights_visible: whether camera rays see lights (reflections always do).
     """
@@ -64,7 +64,8 @@ def render_views(
     step = min(FIRST_SPP, max_spp) if target_error > 0 else max_spp
     while active:
         # two halves that share no path: what tells noise from image
-        for half, first, spp in ((0, taken, step // 2), (1, taken + step // 2, step - step // 2)):
+        middle = step // 2 if target_error > 0 else 0
+        for half, first, spp in ((0, taken, middle), (1, taken + middle, step - middle)):
             for view, sums in zip(active, sample(first, spp, active) if spp else (), strict=bool(spp)):
                 before = halves.setdefault(view, [None, None])
                 before[half] = sums if before[half] is None else before[half] + sums
