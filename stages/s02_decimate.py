@@ -129,7 +129,7 @@ class Decimate(MapStage):
                 **{name: catalogue.spread([m[name] for m in reached]) for name in names},
             }
         draft.note("summary", summary)
-        _write_contact_sheet(inputs, draft, sorted(metas))
+        _write_contact_sheet(inputs, draft, sorted(metas), sorted(config.budgets, reverse=True))
 
     def check(self, draft: Draft) -> None:
         from stages.geometry import measure
@@ -149,14 +149,14 @@ def _catalogue(inputs: Inputs) -> list[dict[str, Any]]:
     return json.loads(inputs["collect"].file("objects.json").read_bytes())
 
 
-def _write_contact_sheet(inputs: Inputs, draft: Draft, ids: list[str]) -> None:
-    """Original, remeshed and every rung of objects spread evenly over the catalogue."""
+def _write_contact_sheet(inputs: Inputs, draft: Draft, ids: list[str], budgets: list[int]) -> None:
+    """Original, remeshed and a column per budget, of objects spread evenly over the catalogue."""
     from stages.geometry import sheet
 
     rows = []
     for id in ids[:: max(1, -(-len(ids) // SHEET_OBJECTS))]:
         before = [MeshRecord.from_record(inputs[name].read(id)) for name in ("collect", "remesh")]
         rungs = load_rungs(draft.read(id))
-        pictures = [(mesh.vertices, mesh.faces) for mesh in before] + [rungs[b] for b in sorted(rungs, reverse=True)]
-        rows.append((f"{id}: original, remeshed, {', '.join(str(b) for b in sorted(rungs, reverse=True))}", pictures))
+        pictures = [(mesh.vertices, mesh.faces) for mesh in before] + [rungs.get(budget) for budget in budgets]
+        rows.append((f"{id}: original, remeshed, {', '.join(map(str, budgets))}", pictures))
     sheet.write_sheet(draft.files / "contact_sheet.png", rows, columns=2)

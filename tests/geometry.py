@@ -210,7 +210,8 @@ def report(results: dict, grid: int, sheet_path: Path | None, artifacts: tuple[A
         for id in worst:
             before = [MeshRecord.from_record(artifact.read(id)) for artifact in (collect, remesh)]
             rungs = load_rungs(decimate.read(id)) if id in decimate else {}
-            rows.append((id, [(m.vertices, m.faces) for m in before] + [rungs[b] for b in sorted(rungs, reverse=True)]))
+            budgets = decimate.manifest["preimage"]["params"]["budgets"]
+            rows.append((id, [(m.vertices, m.faces) for m in before] + [rungs.get(b) for b in sorted(budgets, reverse=True)]))
         sheet.write_sheet(sheet_path, rows)
     return 1 if bad else 0
 
