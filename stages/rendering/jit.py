@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from stages.records import SceneRecord
-from stages.rendering.layers import Sums
+from stages.rendering.sums import Sums
 from stages.rendering.surfaces import face_normals, surface_mesh
 
 SLOTS = 8  # lights per pass; more lights take several passes of the same kernel

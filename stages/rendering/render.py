@@ -22,7 +22,7 @@ from stages.records import SceneRecord, ViewRecord
 from stages.rendering import backend as backends
 from stages.rendering.denoising import denoise as denoise_layer
 from stages.rendering.error import estimated_error
-from stages.rendering.layers import Sums
+from stages.rendering.sums import Sums
 
 MODES = ("physical", "cycles")
 FIRST_SPP = 16  # before the first estimate
@@ -113,21 +113,22 @@ def _sampler(
 
 def _finish(sums: Sums, index: int, denoise: bool, error: float | None) -> ViewRecord:
     """The stored view: every light denoised on its own, and what is to be said of it."""
-    layer = sums.layers()
+    view = sums.view()
+    if denoise:
 
-    def clean(radiance: np.ndarray) -> np.ndarray:
-        return denoise_layer(radiance, layer.albedo, layer.normal, layer.coverage) if denoise else radiance
+        def clean(radiance: np.ndarray) -> np.ndarray:
+            return denoise_layer(radiance, view.albedo, view.normal, view.coverage)
 
-    lights = np.stack([clean(light) for light in layer.lights]) if len(layer.lights) else layer.lights
-    view = ViewRecord(lights, clean(layer.direct), layer.albedo, layer.normal, layer.depth, layer.coverage)
+        view.lights = np.stack([clean(light) for light in view.lights]) if len(view.lights) else view.lights
+        view.direct = clean(view.direct)
     mean = float(view.image.mean(dtype=np.float64))
     view.meta = {
         "index": int(index),
-        "status": "too_close" if layer.nearest < MIN_DEPTH else "dark" if mean < MIN_MEAN else "ok",
+        "status": "too_close" if sums.nearest < MIN_DEPTH else "dark" if mean < MIN_MEAN else "ok",
         "mean": mean,
         "spp": sums.spp,
         "error": error,
         "clamped": clamped_values(view),
-        "nearest": layer.nearest if np.isfinite(layer.nearest) else None,
+        "nearest": sums.nearest if np.isfinite(sums.nearest) else None,
     }
     return view

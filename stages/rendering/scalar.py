@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from stages.records import SceneRecord
-from stages.rendering.layers import Sums
+from stages.rendering.sums import Sums
 from stages.rendering.surfaces import face_normals, mesh_of, surface_mesh
 
 MIN_SPP = 1  # per light

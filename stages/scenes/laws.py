@@ -285,7 +285,10 @@ def _vary_camera(law: CameraLaw, rng: np.random.Generator, camera: Camera) -> No
             camera.inside, camera.position, camera.distance = True, position.tolist(), distance
             camera.fov_deg = float(rng.uniform(*law.inside_fov_deg))
             return
-    raise ValueError(f"no camera in {law.inside} per axis is {law.inside_distance} away from its look-at point")
+    raise UserError(
+        f"no camera in {law.inside} per axis is {law.inside_distance} away from its look-at point: widen scene.cameras.inside "
+        "or lower scene.cameras.inside_distance"
+    )
 
 
 def _draw_wall(laws: Laws, rng: np.random.Generator, template: str, wall: str, patch: bool) -> Placement:

@@ -15,9 +15,9 @@ from pipeline.errors import Reject, UserError
 from pipeline.stage import Item
 from stages.arrays import unpack_json
 from stages.exr import decode_view, encode_view, read_rgb
+from stages.metrics import log_error
 from stages.records import SceneRecord
 from stages.rendering import backend as backends
-from stages.rendering.error import log_error
 from stages.rendering.render import render_views
 from stages.s04_render import Render, RenderConfig
 

@@ -1,4 +1,4 @@
-"""What a renderer hands over for one view: sums over the samples of every pixel, which add up, and their means."""
+"""What a renderer hands over for one view: sums over the samples of every pixel, which add up."""
 
 from __future__ import annotations
 
@@ -6,18 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-
-@dataclass
-class Layers:
-    """Pixel means of one view, see ViewRecord; ``nearest`` is any sample's smallest distance (inf: nothing hit)."""
-
-    lights: np.ndarray
-    direct: np.ndarray
-    albedo: np.ndarray
-    normal: np.ndarray
-    depth: np.ndarray
-    coverage: np.ndarray
-    nearest: float
+from stages.records import ViewRecord
 
 
 @dataclass
@@ -41,14 +30,12 @@ class Sums:
         total = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self) if f.name != "nearest"}
         return Sums(**total, nearest=min(self.nearest, other.nearest))
 
-    def layers(self) -> Layers:
+    def view(self) -> ViewRecord:
+        """The means, without meta."""
+
         def mean(values: np.ndarray) -> np.ndarray:
             return (values / self.spp).astype(np.float32)
 
         depth = np.where(self.hits > 0, self.distance / np.maximum(self.hits, 1e-9), 0).astype(np.float32)
-        return Layers(
-            *(mean(values) for values in (self.lights, self.direct, self.albedo, self.normal)),
-            depth,
-            mean(self.hits),
-            self.nearest,
-        )
+        means = [mean(values) for values in (self.lights, self.direct, self.albedo, self.normal)]
+        return ViewRecord(*means, depth, mean(self.hits))
