@@ -1,9 +1,9 @@
 """OpenEXR files: a rendered view as one multi-layer half-float image, and plain RGB pictures for the commands.
 
 A view's layers are named as EXR viewers expect: ``light0.R`` .. ``light0.B``, ``light1.R`` .., ``direct.R``,
-``albedo.R``, ``normal.X`` .. ``normal.Z``, ``depth.Z``, ``coverage.A``; the header attribute ``lightmill`` holds the
-view's meta as JSON. The same view always gives the same bytes: OpenEXR writes no clock, and compression is lossless
-and done by one thread.
+``albedo.R``, ``normal.X`` .. ``normal.Z``, ``depth.Z``, ``coverage.A``, and ``triangle.id`` and ``object.id`` as 32-bit
+integers plus one, 0 for nothing; the header attribute ``lightmill`` holds the view's meta as JSON. The same view always
+gives the same bytes: OpenEXR writes no clock, and compression is lossless and done by one thread.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ HALF_MAX = 65504.0  # largest finite half float
 META = "lightmill"  # header attribute
 # Single layers of a view: name, channels (in the order of the array's last axis).
 LAYERS = {"direct": "RGB", "albedo": "RGB", "normal": "XYZ", "depth": "Z", "coverage": "A"}
+INDICES = ("triangle", "object")
 
 
 def _encode(header: dict, channels: dict[str, np.ndarray]) -> bytes:
@@ -57,6 +58,7 @@ def encode_view(view: ViewRecord) -> bytes:
     for name, (pixels, letters) in layers.items():
         half = np.clip(pixels, -HALF_MAX, HALF_MAX).astype(np.float16).reshape(*pixels.shape[:2], len(letters))
         channels |= {f"{name}.{letter}": half[..., index] for index, letter in enumerate(letters)}
+    channels |= {f"{name}.id": (getattr(view, name) + 1).astype(np.uint32) for name in INDICES}
     return _encode({META: pack_json(view.meta).decode()}, channels)
 
 
@@ -71,6 +73,7 @@ def decode_view(data: bytes, where: str = "the view") -> ViewRecord:
         return pixels if len(letters) > 1 else pixels[..., 0]
 
     single = {name: layer(name, letters) for name, letters in LAYERS.items()}
+    single |= {name: channels[f"{name}.id"].astype(np.int32) - 1 for name in INDICES}
     count = sum(name.startswith("light") and name.endswith(".R") for name in channels)
     lights = [layer(f"light{index}", "RGB") for index in range(count)]
     shape = (0, *single["direct"].shape)

@@ -122,6 +122,8 @@ class ViewRecord:
     direct: (H, W, 3) float32 radiance that reached the camera after at most one bounce, summed over lights.
     albedo: (H, W, 3) float32, diffuse + specular at the first hit. normal: (H, W, 3) float32, world-space shading normal.
     depth: (H, W) float32, distance along the ray in scene units, 0 where nothing was hit. coverage: (H, W) float32 in [0, 1].
+    triangle, object: (H, W) int32, what the pixel's first sample hit: row of ``SceneRecord.triangles`` and its
+        ``object_index``; -1 for nothing.
     meta: JSON. ``index`` (camera), ``status`` ok|dark|too_close, ``mean``, ``nearest``, ``spp``, ``error`` (estimated, see
         ``stages.rendering.error``), ``clamped`` half-floats.
     """
@@ -132,6 +134,8 @@ class ViewRecord:
     normal: np.ndarray
     depth: np.ndarray
     coverage: np.ndarray
+    triangle: np.ndarray
+    object: np.ndarray
     meta: dict[str, Any] = field(default_factory=dict)
 
     @property

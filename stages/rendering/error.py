@@ -8,18 +8,13 @@ the same in both; the two grow together, so one factor serves. It has not been c
 from __future__ import annotations
 
 from stages.metrics import log_error
+from stages.records import ViewRecord
 from stages.rendering.denoising import denoise
-from stages.rendering.sums import Sums
 
 DENOISED_FACTOR = 1.0  # true error of the whole over the difference of its denoised halves
 
 
-def estimated_error(a: Sums | None, b: Sums | None, denoised: bool) -> float | None:
-    """Of the image with all lights on, from the samples of both halves; None where there is only one half."""
-    if a is None or b is None:
-        return None
-    images = []
-    for half in (a, b):
-        view = half.view()
-        images.append(denoise(view.image, view.albedo, view.normal, view.coverage) if denoised else view.image)
+def estimated_error(a: ViewRecord, b: ViewRecord, denoised: bool) -> float:
+    """Of the image with all lights on, from the views of both halves, not denoised."""
+    images = [denoise(v.image, v.albedo, v.normal, v.coverage) if denoised else v.image for v in (a, b)]
     return log_error(*images) * (DENOISED_FACTOR if denoised else 0.5)

@@ -1,4 +1,4 @@
-"""Path tracing with an integrator of our own on Dr.Jit (CUDA or LLVM): radiance per light and first-hit channels in one
+"""Path tracing with an integrator of our own on Dr.Jit (CUDA or LLVM): radiance per light and first-hit layers in one
 pass.
 
 Light transport is linear, so one path serves all lights: each contribution goes to the slot of the light that it
@@ -6,9 +6,9 @@ came from. The integrator keeps its own light arrays, picks a light triangle by 
 and knows a light that a ray hits by its triangle index. Next-event estimation and BSDF sampling are combined by the
 power heuristic.
 
-A pixel's samples are neighbours in the wavefront and are added in order on the host, never by atomics, and a
-sample's random numbers depend on (seed, view, pixel, sample) only: the bytes are the same for any thread count and
-any chunk size.
+One lane of the kernel traces BLOCK samples of a pixel, the next one as soon as a path ends, and keeps their sums: lanes
+of a vector stay busy, and nothing is added by atomics. The host adds a pixel's blocks in order. A sample is a function of
+(seed, stream, view, pixel, number) only: the bytes are the same for any thread count and any chunk size.
 """
 
 from __future__ import annotations
@@ -20,15 +20,18 @@ import mitsuba as mi
 import numpy as np
 
 from stages.records import SceneRecord
+from stages.rendering.lights import SLOTS, LightTable
+from stages.rendering.sobol import Sampler, mixed
 from stages.rendering.sums import Sums
-from stages.rendering.surfaces import face_normals, surface_mesh
+from stages.rendering.surfaces import floats, surface_mesh
 
-SLOTS = 8  # lights per pass; more lights take several passes of the same kernel
-OTHER = SLOTS  # slot of a light that belongs to another pass: hidden like any light, black here
-CHUNK = 1 << 19  # paths in flight: 40 floats of results each, about 80 MB
+BLOCK = 8  # samples of a lane: also the steps in which samples can be asked for
+CHUNK = 1 << 19  # lanes in flight: 40 floats of results each, about 80 MB
 RR_DEPTH = 5  # bounces before Russian roulette may end a path
 FILTER_CELLS = 1024
-R2_STEPS = (3242174889, 2447445414)  # 2^32 / g and 2^32 / g^2 with g^3 = g + 1: Roberts' R2 sequence
+# Dimensions of a bounce for the sampler; camera rays come before the first bounce.
+LIGHT_AND_LOBE, LIGHT_POINT, DIRECTION, ROULETTE, DIMENSIONS = range(5)
+FILM = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
@@ -58,56 +61,47 @@ def filter_offsets(name: str) -> np.ndarray:
     return 1.5 * np.interp(u, cumulative / cumulative[-1], x)
 
 
-def alias_table(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Walker's alias method: (threshold, alias); cell floor(u n) keeps itself with its threshold's probability."""
-    count = len(weights)
-    scaled = weights * count / weights.sum()
-    threshold, alias = np.ones(count), np.arange(count)
-    small = [index for index in range(count) if scaled[index] < 1]
-    large = [index for index in range(count) if scaled[index] >= 1]
-    while small and large:
-        low, high = small.pop(), large.pop()
-        threshold[low], alias[low] = scaled[low], high
-        scaled[high] -= 1 - scaled[low]
-        (small if scaled[high] < 1 else large).append(high)
-    return threshold, alias
+class Cameras:
+    """Rays of a scene's cameras through points of the pixels' filter; image row 0 is on top."""
+
+    def __init__(self, scene: SceneRecord, resolution: int, filter_name: str):
+        self.pose = floats(scene.camera_to_world[:, :3].reshape(-1, 12))
+        self.focal = floats(0.5 / np.tan(0.5 * np.radians(scene.fov_deg.astype(np.float64))))  # image width 1
+        self.filter = floats(filter_offsets(filter_name))
+        self.resolution = dr.opaque(mi.UInt32, resolution)
+
+    def ray(self, pixel: mi.UInt32, u: mi.Point2f) -> mi.Ray3f:
+        """``pixel`` counts row by row through all views; ``u`` in [0, 1)^2."""
+        side = self.resolution
+        view = pixel // (side * side)
+        inside = pixel - view * side * side
+        row = inside // side
+        column = inside - row * side
+        x = (mi.Float(column) + 0.5 + self._offset(u.x)) / mi.Float(side) - 0.5
+        y = (mi.Float(row) + 0.5 + self._offset(u.y)) / mi.Float(side) - 0.5
+        local = dr.normalize(mi.Vector3f(x, -y, -dr.gather(mi.Float, self.focal, view)))
+        entry = [dr.gather(mi.Float, self.pose, 12 * view + index) for index in range(12)]
+        direction = mi.Vector3f(
+            *[entry[4 * axis] * local.x + entry[4 * axis + 1] * local.y + entry[4 * axis + 2] * local.z for axis in range(3)]
+        )
+        return mi.Ray3f(mi.Point3f(entry[3], entry[7], entry[11]), dr.normalize(direction))
+
+    def _offset(self, u: mi.Float) -> mi.Float:
+        u = u * FILTER_CELLS
+        cell = dr.minimum(mi.UInt32(u), FILTER_CELLS - 1)
+        low, high = dr.gather(mi.Float, self.filter, cell), dr.gather(mi.Float, self.filter, cell + 1)
+        return low + (high - low) * (u - mi.Float(cell))
 
 
-class LightTable:
-    """The lights of one pass: slot, radiance and sampling density per triangle, and the table to pick from."""
+@dataclass
+class Lanes:
+    """What the lanes of a kernel trace: where their rays start, and which samples."""
 
-    def __init__(self, scene: SceneRecord, first: int):
-        index = scene.light_index.astype(np.int64)
-        mine = (index >= first) & (index < first + SLOTS)
-        slot = np.where(mine, index - first, np.where(index >= 0, OTHER, -1))
-        emission = np.where(mine[:, None], scene.emission, 0).astype(np.float32)
-        cross = face_normals(scene.triangles)
-        length = np.linalg.norm(cross, axis=1)
-        power = emission.sum(axis=1, dtype=np.float64) * length
-        chosen = np.nonzero(power > 0)[0]  # lights without power get no samples
-        if len(chosen) == 0:
-            chosen, power = (
-                np.array([0]),
-                np.where(np.arange(len(power)) == 0, 1.0, 0.0),
-            )  # radiance is 0: any table does
-        threshold, alias = alias_table(power[chosen])
-        density = np.zeros(len(power))  # per unit area
-        density[chosen] = power[chosen] / power[chosen].sum() / np.maximum(0.5 * length[chosen], 1e-30)
-        normal = cross / np.maximum(length, 1e-30)[:, None]
-
-        self.slot = mi.Int32(slot.astype(np.int32))
-        self.emission = _floats(emission)
-        self.density = _floats(density)
-        self.normal = _floats(normal)
-        self.vertices = _floats(scene.triangles)
-        self.count = dr.opaque(mi.UInt32, len(chosen))
-        self.triangle = mi.UInt32(chosen.astype(np.uint32))
-        self.threshold = _floats(threshold)
-        self.alias = mi.UInt32(alias.astype(np.uint32))
-
-
-def _floats(values: np.ndarray) -> mi.Float:
-    return mi.Float(np.ascontiguousarray(values, dtype=np.float32).reshape(-1))
+    start: Cameras
+    pixel: mi.UInt32
+    key: mi.UInt32  # of the random numbers
+    first: mi.UInt32  # number of the first sample
+    count: mi.UInt32  # samples
 
 
 def _add(slots: list, slot: mi.Int32, value: mi.Color3f) -> list:
@@ -115,38 +109,50 @@ def _add(slots: list, slot: mi.Int32, value: mi.Color3f) -> list:
 
 
 @dr.syntax
-def trace_paths(scene, lights, albedo, ray, rng, limits, hide):
-    """One path per ray. Returns (light slots, direct, albedo, normal, distance, coverage), one value per path.
+def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide):
+    """Sums over the samples of each lane: (light slots, direct, albedo, normal, distance, hits, nearest distance, triangle).
 
     ``limits``: opaque (bounces, diffuse bounces, glossy bounces, indirect clamp on the sum over RGB). ``hide``: opaque
-    bool, camera rays pass through lights.
+    bool, camera rays pass through lights. The triangle is that of the first sample, -1 where it hit nothing.
     """
     max_bounces, max_diffuse, max_glossy, clamp = limits
     context = mi.BSDFContext()
     slots = [mi.Color3f(0) for _ in range(SLOTS)]
-    direct = mi.Color3f(0)
-    first_albedo, first_normal = mi.Color3f(0), mi.Normal3f(0)
-    first_distance, coverage = mi.Float(0), mi.Float(0)
-    origin = mi.Point3f(ray.o)
-    throughput = mi.Color3f(1)
-    bsdf_pdf = mi.Float(0)
-    bounce, diffuse, glossy = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-    active = mi.Bool(True)
+    direct, albedos, normals = mi.Color3f(0), mi.Color3f(0), mi.Normal3f(0)
+    distances, hits, nearest = mi.Float(0), mi.Float(0), mi.Float(dr.inf)
+    triangle = mi.Int32(-1)
 
-    while active:
-        si = scene.ray_intersect(ray, active)
-        active &= si.is_valid()
-        slot = dr.select(active, dr.gather(mi.Int32, lights.slot, si.prim_index, active), -1)
+    done = mi.UInt32(0)
+    ray = dr.zeros(mi.Ray3f)
+    origin = mi.Point3f(0)
+    fresh = mi.Bool(True)
+    throughput, bsdf_pdf = mi.Color3f(1), mi.Float(0)
+    bounce, diffuse, glossy = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+
+    while done < lanes.count:
+        number = lanes.first + done
+        start = lanes.start.ray(lanes.pixel, Sampler(lanes.key, number).two(mi.UInt32(FILM)))
+        origin = dr.select(fresh, start.o, origin)
+        ray = dr.select(fresh, start, ray)
+        sampler = Sampler(lanes.key ^ pass_key, number)
+        dimension = bounce * DIMENSIONS
+
+        si = scene.ray_intersect(ray)
+        found = si.is_valid()
+        slot = dr.select(found, dr.gather(mi.Int32, lights.slot, si.prim_index, found), -1)
         on_light = slot >= 0
         through = on_light & (bounce == 0) & hide  # a camera ray goes on behind a hidden light
 
         # First hit. The shading normal is turned to the viewer, as the two-sided material does.
-        first = active & (bounce == 0) & ~through
+        first = found & (bounce == 0) & ~through
         facing = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -1, 1)
-        first_normal = dr.select(first, si.sh_frame.n * facing, first_normal)
-        first_albedo = dr.select(first, dr.gather(mi.Color3f, albedo, si.prim_index, first), first_albedo)
-        first_distance = dr.select(first, dr.norm(si.p - origin), first_distance)
-        coverage = dr.select(first, 1, coverage)
+        distance = dr.norm(si.p - origin)
+        normals += dr.select(first, si.sh_frame.n * facing, 0)
+        albedos += dr.select(first, dr.gather(mi.Color3f, albedo, si.prim_index, first), 0)
+        distances += dr.select(first, distance, 0)
+        nearest = dr.minimum(nearest, dr.select(first, distance, dr.inf))
+        hits += dr.select(first, 1, 0)
+        triangle = dr.select(first & (done == 0), mi.Int32(si.prim_index), triangle)
 
         # Emission met by chance: weighted against the chance of next-event estimation to find it.
         hit = on_light & ~through & (slot < SLOTS)
@@ -159,38 +165,28 @@ def trace_paths(scene, lights, albedo, ray, rng, limits, hide):
         direct += dr.select(bounce <= 1, value, 0)
 
         # Next-event estimation at surfaces; lights reflect nothing.
-        surface = active & ~on_light & (bounce < max_bounces) & (diffuse <= max_diffuse) & (glossy <= max_glossy)
+        surface = found & ~on_light & (bounce < max_bounces) & (diffuse <= max_diffuse) & (glossy <= max_glossy)
         bsdf = si.bsdf(ray)
-        u = rng.next_float32() * lights.count
-        cell = dr.minimum(mi.UInt32(u), lights.count - 1)
-        keep = u - mi.Float(cell) < dr.gather(mi.Float, lights.threshold, cell)
-        cell = dr.select(keep, cell, dr.gather(mi.UInt32, lights.alias, cell))
-        triangle = dr.gather(mi.UInt32, lights.triangle, cell)
-        root, v = dr.sqrt(rng.next_float32()), rng.next_float32()
-        a, b, c = [dr.gather(mi.Point3f, lights.vertices, 3 * triangle + corner) for corner in range(3)]
-        point = a * (1 - root) + b * (root * (1 - v)) + c * (root * v)
+        choice = sampler.two(dimension + LIGHT_AND_LOBE)
+        lit, point = lights.sample(choice.x, sampler.two(dimension + LIGHT_POINT))
         shadow = si.spawn_ray_to(point)
         to_light = point - si.p
         distance2 = dr.squared_norm(to_light)
         to_light *= dr.rsqrt(dr.maximum(distance2, 1e-30))
-        cosine = dr.abs(dr.dot(dr.gather(mi.Normal3f, lights.normal, triangle), to_light))
-        density = dr.gather(mi.Float, lights.density, triangle)
+        cosine = dr.abs(dr.dot(dr.gather(mi.Normal3f, lights.normal, lit), to_light))
+        density = dr.gather(mi.Float, lights.density, lit)
         sampled = surface & (cosine > 0) & (distance2 > 0) & (density > 0)
         reflected, pdf = bsdf.eval_pdf(context, si, si.to_local(to_light), sampled)
         sampled &= dr.max(reflected) > 0
         sampled &= ~scene.ray_test(shadow, sampled)
         light_pdf = density * distance2 / dr.maximum(cosine, 1e-9)
-        value = (
-            throughput * reflected * dr.gather(mi.Color3f, lights.emission, triangle) * (mis_weight(light_pdf, pdf) / light_pdf)
-        )
+        value = throughput * reflected * dr.gather(mi.Color3f, lights.emission, lit) * (mis_weight(light_pdf, pdf) / light_pdf)
         value = dr.select(sampled, clamped(value, dr.select(bounce > 0, clamp, dr.inf)), 0)
-        slots = _add(slots, dr.gather(mi.Int32, lights.slot, triangle), value)
+        slots = _add(slots, dr.gather(mi.Int32, lights.slot, lit), value)
         direct += dr.select(bounce == 0, value, 0)
 
         # The next direction, from the material.
-        sample, scattered = bsdf.sample(
-            context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), surface
-        )
+        sample, scattered = bsdf.sample(context, si, choice.y, sampler.two(dimension + DIRECTION), surface)
         is_glossy = mi.has_flag(sample.sampled_type, mi.BSDFFlags.GlossyReflection)
         glossy += dr.select(surface & is_glossy, 1, 0)
         diffuse += dr.select(surface & ~is_glossy, 1, 0)
@@ -198,13 +194,18 @@ def trace_paths(scene, lights, albedo, ray, rng, limits, hide):
         throughput = dr.select(surface, throughput * scattered, throughput)
         bsdf_pdf = dr.select(surface, sample.pdf, bsdf_pdf)
         brightest = dr.max(throughput)
-        survival = dr.select(surface & (bounce >= RR_DEPTH), dr.minimum(brightest, 0.95), 1)
-        lives = surface & (brightest > 0) & (rng.next_float32() < survival)
+        survival = dr.select(bounce >= RR_DEPTH, dr.minimum(brightest, 0.95), 1)
+        lives = surface & (brightest > 0) & (sampler.one(dimension + ROULETTE) < survival)
         throughput = dr.select(lives, throughput / survival, throughput)
         ray = dr.select(through, si.spawn_ray(ray.d), si.spawn_ray(si.to_world(sample.wo)))
-        active = lives | through
 
-    return slots, direct, first_albedo, first_normal, first_distance, coverage
+        # The path goes on, or the lane's next sample begins.
+        fresh = ~(lives | through)
+        done += dr.select(fresh, 1, 0)
+        throughput, bsdf_pdf = dr.select(fresh, 1, throughput), dr.select(fresh, 0, bsdf_pdf)
+        bounce, diffuse, glossy = [dr.select(fresh, 0, count) for count in (bounce, diffuse, glossy)]
+
+    return slots, direct, albedos, normals, distances, hits, nearest, triangle
 
 
 def mis_weight(pdf, other):
@@ -222,160 +223,95 @@ def clamped(value, limit):
 class JitRenderer:
     """One scene, ready to be seen from its cameras."""
 
-    def __init__(self, scene: SceneRecord):
-        self.record = scene
+    def __init__(self, scene: SceneRecord, resolution: int, seed: int, limits: Limits, lights_visible: bool):
+        self.record, self.resolution, self.seed = scene, resolution, seed
+        self.limits, self.lights_visible = limits, lights_visible
         mesh = surface_mesh(scene, np.arange(len(scene.triangles)))
         self.scene = mi.load_dict({"type": "scene", "surface": mesh})
         emits = (scene.light_index >= 0)[:, None]
-        self.albedo = _floats(np.where(emits, 0, scene.diffuse + scene.specular))
+        self.albedo = floats(np.where(emits, 0, scene.diffuse + scene.specular))
         self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
+        self.cameras = Cameras(scene, resolution, limits.filter)
 
-    def sample(
-        self, resolution: int, first: int, spp: int, seed: int, views: list[int], limits: Limits, lights_visible: bool
-    ) -> list[Sums]:
-        """Sums of each view over the samples ``first`` to ``first + spp`` of every pixel; a path serves all lights."""
-        pixels = resolution * resolution
-        ids = np.concatenate([view * pixels + np.arange(pixels) for view in views]).astype(np.uint32)
-        passes = [
-            self._pass(table, number, ids, resolution, first, spp, seed, limits, lights_visible)
-            for number, table in enumerate(self.passes)
-        ]
-        lights = np.concatenate([p["lights"] for p in passes])[: self.record.n_lights]
-        direct = sum(p["direct"] for p in passes)
+    def sample(self, views: list[int], streams: list[int], first: int, spp: int) -> list[list[Sums]]:
+        """Per stream, the sums of each view over the stream's samples ``first`` to ``first + spp`` of every pixel.
+
+        Streams share no path. ``first`` is a multiple of BLOCK. A path serves all lights.
+        """
+        pixels = self.resolution * self.resolution
+        ids = np.concatenate([view * pixels + np.arange(pixels) for view in views])
+        passes = [self._pass(table, number, ids, streams, first, spp) for number, table in enumerate(self.passes)]
+        shape = (len(streams), len(views), self.resolution, self.resolution)
+        lights = np.concatenate([p["lights"] for p in passes], axis=-2)[..., : self.record.n_lights, :]
         hit = passes[0]  # the camera rays of all passes are the same
-        sums = []
-        for index in range(len(views)):
-            part = slice(index * pixels, (index + 1) * pixels)
-
-            def image(values: np.ndarray, part=part) -> np.ndarray:
-                values = values[..., part, :]
-                return values.reshape(*values.shape[:-2], resolution, resolution, values.shape[-1])
-
-            sums.append(
-                Sums(
-                    spp,
-                    *(image(values) for values in (lights, direct, hit["albedo"], hit["normal"])),
-                    image(hit["distance"])[..., 0],
-                    image(hit["coverage"])[..., 0],
-                    float(hit["nearest"][part].min(initial=np.inf)),
-                )
-            )
-        return sums
+        images = {name: values.reshape(*shape, *values.shape[2:]) for name, values in hit.items()}
+        images["direct"] = sum(p["direct"] for p in passes).reshape(*shape, 3)
+        images["lights"] = np.moveaxis(lights.reshape(*shape, -1, 3), -2, 2)
+        return [
+            [Sums(spp, **{name: image[stream, view] for name, image in images.items()}) for view in range(len(views))]
+            for stream in range(len(streams))
+        ]
 
     def _pass(
-        self,
-        table: LightTable,
-        number: int,
-        ids: np.ndarray,
-        resolution: int,
-        first: int,
-        spp: int,
-        seed: int,
-        limits: Limits,
-        lights_visible: bool,
+        self, table: LightTable, number: int, ids: np.ndarray, streams: list[int], first: int, spp: int
     ) -> dict[str, np.ndarray]:
-        """Sums over the samples, float64 (pixels, channels) each; ``lights`` (SLOTS, pixels, 3), ``nearest`` a minimum."""
-        count = len(ids)
-        widths = {"direct": 3, "albedo": 3, "normal": 3, "distance": 1, "coverage": 1}
-        sums = {name: np.zeros((count, width)) for name, width in widths.items()}
-        sums["lights"] = np.zeros((SLOTS, count, 3))
-        sums["nearest"] = np.full((count, 1), np.inf)
-        samples = min(spp, CHUNK // 64)
-        for done in range(0, spp, samples):
-            depth = min(samples, spp - done)
-            rows = max(CHUNK // depth, 1)
-            for start in range(0, count, rows):
-                part = slice(start, min(start + rows, count))
-                values = self._chunk(table, number, ids[part], first + done, depth, resolution, seed, limits, lights_visible)
-                for name, value in values.items():
-                    shaped = value.reshape(*value.shape[:-1], -1, depth)  # (.., channels, pixels, samples)
-                    total = np.moveaxis(shaped.sum(axis=-1, dtype=np.float64), -1, -2)
-                    sums[name][..., part, :] += total
-                hit = values["coverage"].reshape(-1, depth) > 0
-                nearest = np.where(hit, values["distance"].reshape(-1, depth), np.inf).min(axis=1, keepdims=True)
-                sums["nearest"][part] = np.minimum(sums["nearest"][part], nearest)
-        return sums
+        """(streams, pixels, ..) sums over the samples, float64; ``lights`` (.., SLOTS, 3)."""
+        blocks = -(-spp // BLOCK)
+        lane_count = len(streams) * len(ids) * blocks
+        results: dict[str, list[np.ndarray]] = {}
+        for start in range(0, lane_count, CHUNK):
+            lane = np.arange(start, min(start + CHUNK, lane_count))
+            row, block = lane // blocks, lane % blocks
+            stream = np.asarray(streams)[row // len(ids)]
+            counts = np.minimum(BLOCK, spp - block * BLOCK)
+            values = self._chunk(table, number, ids[row % len(ids)], stream, first + block * BLOCK, counts)
+            for name, value in values.items():
+                results.setdefault(name, []).append(value)
+        whole = {name: np.concatenate(parts, axis=-1) for name, parts in results.items()}
+
+        def shaped(values: np.ndarray) -> np.ndarray:  # (.., lanes) -> (streams, pixels, blocks, ..)
+            return np.moveaxis(values.reshape(*values.shape[:-1], len(streams), len(ids), blocks), (-3, -2, -1), (0, 1, 2))
+
+        summed = ("lights", "direct", "albedo", "normal", "distance", "hits")
+        sums = {name: shaped(whole[name]).sum(axis=2, dtype=np.float64) for name in summed}
+        return sums | {"nearest": shaped(whole["nearest"]).min(axis=2), "triangle": shaped(whole["triangle"])[:, :, 0]}
 
     def _chunk(
-        self,
-        table: LightTable,
-        number: int,
-        ids: np.ndarray,
-        first: int,
-        depth: int,
-        resolution: int,
-        seed: int,
-        limits: Limits,
-        lights_visible: bool,
+        self, table: LightTable, number: int, pixel: np.ndarray, stream: np.ndarray, first: np.ndarray, count: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Every path's values for ``depth`` samples of the pixels ``ids``, from sample ``first``: (channels, paths)."""
+        """Every lane's sums, (.., lanes) float32."""
 
         def opaque(value: int) -> mi.UInt32:
-            return dr.opaque(mi.UInt32, value)
+            return dr.opaque(mi.UInt32, value & 0xFFFFFFFF)
 
-        size = len(ids) * depth
-        index = dr.arange(mi.UInt32, size)
-        row = index // opaque(depth)
-        pixel = dr.gather(mi.UInt32, mi.UInt32(ids), row)
-        sample = index - row * opaque(depth) + opaque(first)
-        low, high = opaque(seed & 0xFFFFFFFF), opaque((seed >> 32) & 0xFFFFFFFF)
-        # Points in the pixel follow the additive R2 sequence from a random start of its own: even at any count,
-        # so edges are smooth, and alike in every pass, so first hits agree.
-        start = mi.sample_tea_32(pixel ^ low, ~high)
-        points = [(shift + sample * opaque(step)) >> 8 for shift, step in zip(start, R2_STEPS, strict=True)]
-        ray = self._camera_rays(pixel, [mi.Float(point) * 2.0**-24 for point in points], resolution, limits.filter)
-        state = mi.sample_tea_32(pixel ^ low, sample ^ high)
-        stream = mi.UInt64(state[1]) + (mi.UInt64(opaque(number)) << 32)
-        # No `size` here: with it the constructor would add the position in the wavefront to the stream.
-        rng = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=stream)
-
+        ids, streams = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(stream.astype(np.uint32))
+        # one to one in the pixel for a given seed, so no two pixels of a scene share their numbers
+        key = mixed(mixed(mixed(ids + opaque(self.seed)) + opaque(self.seed >> 32)) + streams)
+        lanes = Lanes(self.cameras, ids, key, mi.UInt32(first.astype(np.uint32)), mi.UInt32(count.astype(np.uint32)))
+        limits = self.limits
         bounds = (
             opaque(limits.bounces),
             opaque(limits.diffuse_bounces),
             opaque(limits.glossy_bounces),
             dr.opaque(mi.Float, 3 * limits.indirect_clamp),
         )
-        slots, direct, albedo, normal, distance, coverage = trace_paths(
-            self.scene, table, self.albedo, ray, rng, bounds, dr.opaque(mi.Bool, not lights_visible)
-        )
-        dr.eval(slots, direct, albedo, normal, distance, coverage)
-        one = [distance, coverage]
-        wide = [direct, albedo, normal]
+        hide = dr.opaque(mi.Bool, not self.lights_visible)
+        out = trace_paths(self.scene, table, self.albedo, lanes, opaque(number * 0x5851F42D), bounds, hide)
+        dr.eval(out)
+        slots, *wide, distances, hits, nearest, triangle = out
+        size = len(pixel)
         return {
             "lights": np.stack([_channels(slot, size) for slot in slots]),
             **{name: _channels(value, size) for name, value in zip(("direct", "albedo", "normal"), wide, strict=True)},
-            **{name: value.numpy()[None] for name, value in zip(("distance", "coverage"), one, strict=True)},
+            "distance": distances.numpy(),
+            "hits": hits.numpy(),
+            "nearest": nearest.numpy(),
+            "triangle": triangle.numpy(),
         }
-
-    def _camera_rays(self, pixel: mi.UInt32, points: list[mi.Float], resolution: int, filter_name: str) -> mi.Ray3f:
-        """Rays through points of the pixels' filter, given as two numbers in [0, 1) each; image row 0 is on top."""
-        cameras = _floats(np.concatenate([self.record.camera_to_world[:, :3].reshape(-1, 12)], axis=1))
-        focal = _floats(0.5 / np.tan(0.5 * np.radians(self.record.fov_deg.astype(np.float64))))  # image width 1
-        side = dr.opaque(mi.UInt32, resolution)
-        view = pixel // (side * side)
-        inside = pixel - view * side * side
-        row = inside // side
-        column = inside - row * side
-        table = _floats(filter_offsets(filter_name))
-
-        def offset(point: mi.Float) -> mi.Float:
-            u = point * FILTER_CELLS
-            cell = dr.minimum(mi.UInt32(u), FILTER_CELLS - 1)
-            low, high = dr.gather(mi.Float, table, cell), dr.gather(mi.Float, table, cell + 1)
-            return low + (high - low) * (u - mi.Float(cell))
-
-        x = (mi.Float(column) + 0.5 + offset(points[0])) / mi.Float(side) - 0.5
-        y = (mi.Float(row) + 0.5 + offset(points[1])) / mi.Float(side) - 0.5
-        local = dr.normalize(mi.Vector3f(x, -y, -dr.gather(mi.Float, focal, view)))
-        entry = [dr.gather(mi.Float, cameras, 12 * view + index) for index in range(12)]
-        direction = mi.Vector3f(
-            *[entry[4 * axis] * local.x + entry[4 * axis + 1] * local.y + entry[4 * axis + 2] * local.z for axis in range(3)]
-        )
-        return mi.Ray3f(mi.Point3f(entry[3], entry[7], entry[11]), dr.normalize(direction))
 
 
 def _channels(value, size: int) -> np.ndarray:
-    """(3, paths) float32 from a three-channel value, which may be a literal."""
+    """(3, lanes) float32 from a three-channel value, which may be a literal."""
     out = np.empty((3, size), np.float32)
     for axis in range(3):
         out[axis] = value[axis].numpy()

@@ -11,6 +11,8 @@ Modes:
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -61,24 +63,27 @@ def render_views(
     records = {}
     active = list(range(len(scene.camera_to_world))) if views is None else list(views)
     order, halves, taken = list(active), {}, 0
-    step = min(FIRST_SPP, max_spp) if target_error > 0 else max_spp
+    # With a target, two streams that share no path: what tells noise from image.
+    streams = [0, 1] if target_error > 0 and max_spp > 1 else [0]
+    total = max_spp // len(streams)  # of each stream
+    step = min(FIRST_SPP // 2, total) if len(streams) > 1 else total
     while active:
-        # two halves that share no path: what tells noise from image
-        middle = step // 2 if target_error > 0 else 0
-        for half, first, spp in ((0, taken, middle), (1, taken + middle, step - middle)):
-            for view, sums in zip(active, sample(first, spp, active) if spp else (), strict=bool(spp)):
-                before = halves.setdefault(view, [None, None])
-                before[half] = sums if before[half] is None else before[half] + sums
+        for stream, found in enumerate(sample(active, streams, taken, step)):
+            for view, sums in zip(active, found, strict=True):
+                before = halves.setdefault(view, {})
+                before[stream] = before[stream] + sums if stream in before else sums
         taken += step
         left = []
         for view in active:
-            estimate = estimated_error(*halves[view], denoised=denoise)
-            if taken < max_spp and estimate is not None and estimate > target_error:
+            estimate = None
+            if len(streams) > 1:
+                estimate = estimated_error(*(half.view(scene.object_index) for half in halves[view].values()), denoise)
+            if taken < total and estimate > target_error:
                 left.append(view)
             else:
-                a, b = halves.pop(view)
-                records[view] = _finish(b if a is None else a + b, view, denoise, estimate)
-        active, step = left, min(taken, max_spp - taken)
+                sums = functools.reduce(operator.add, halves.pop(view).values())
+                records[view] = _finish(sums, scene, view, denoise, estimate)
+        active, step = left, min(taken, total - taken)
     return [records[view] for view in order]
 
 
@@ -90,15 +95,14 @@ def _sampler(
     mode: str,
     max_depth: int,
     lights_visible: bool,
-) -> Callable[[int, int, list[int]], list[Sums]]:
-    """(first sample, samples, views) -> sums of each view."""
+) -> Callable[[list[int], list[int], int, int], list[list[Sums]]]:
+    """(views, streams, first sample, samples of each stream) -> per stream, the sums of each view."""
     if backend["backend"] == "scalar":
         if mode == "cycles":
             raise UserError("mode=cycles needs a JIT backend of Mitsuba, and none works here: " + backends.INSTALL)
         from stages.rendering.scalar import ScalarRenderer
 
-        scalar = ScalarRenderer(scene, lights_visible)
-        return lambda first, spp, views: scalar.sample(resolution, first, spp, seed, views, max_depth)
+        return ScalarRenderer(scene, resolution, seed, max_depth, lights_visible).sample
     from stages.rendering.jit import JitRenderer, Limits
 
     # Cycles lets light in at the hit behind the last counted bounce, hence 12 + 1.
@@ -107,13 +111,13 @@ def _sampler(
         if mode == "physical"
         else Limits(min(max_depth - 1, 13), 4, 4, indirect_clamp=10.0, filter="blackman-harris")
     )
-    jit = JitRenderer(scene)
-    return lambda first, spp, views: jit.sample(resolution, first, spp, seed, views, limits, lights_visible)
+    return JitRenderer(scene, resolution, seed, limits, lights_visible).sample
 
 
-def _finish(sums: Sums, index: int, denoise: bool, error: float | None) -> ViewRecord:
+def _finish(sums: Sums, scene: SceneRecord, index: int, denoise: bool, error: float | None) -> ViewRecord:
     """The stored view: every light denoised on its own, and what is to be said of it."""
-    view = sums.view()
+    view = sums.view(scene.object_index)
+    nearest = float(sums.nearest.min())
     if denoise:
 
         def clean(radiance: np.ndarray) -> np.ndarray:
@@ -124,11 +128,11 @@ def _finish(sums: Sums, index: int, denoise: bool, error: float | None) -> ViewR
     mean = float(view.image.mean(dtype=np.float64))
     view.meta = {
         "index": int(index),
-        "status": "too_close" if sums.nearest < MIN_DEPTH else "dark" if mean < MIN_MEAN else "ok",
+        "status": "too_close" if nearest < MIN_DEPTH else "dark" if mean < MIN_MEAN else "ok",
         "mean": mean,
         "spp": sums.spp,
         "error": error,
         "clamped": clamped_values(view),
-        "nearest": sums.nearest if np.isfinite(sums.nearest) else None,
+        "nearest": nearest if np.isfinite(nearest) else None,
     }
     return view

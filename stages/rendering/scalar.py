@@ -23,8 +23,8 @@ GAP = 1e-5  # distance of a light's side from its true plane, over the largest c
 class ScalarRenderer:
     """One scene, ready to be seen from its cameras."""
 
-    def __init__(self, scene: SceneRecord, lights_visible: bool):
-        self.record = scene
+    def __init__(self, scene: SceneRecord, resolution: int, seed: int, max_depth: int, lights_visible: bool):
+        self.record, self.resolution, self.seed, self.max_depth = scene, resolution, seed, max_depth
         self.lights_visible = lights_visible
         surfaces = np.nonzero(scene.light_index < 0)[0]
         shapes = {"surface": surface_mesh(scene, surfaces)} if len(surfaces) else {}
@@ -42,14 +42,17 @@ class ScalarRenderer:
                     self.emitters.append((name, light, radiance, weight))
         self.scene = mi.load_dict({"type": "scene", **shapes})
         self.params = mi.traverse(self.scene)
-        shown = np.arange(len(scene.triangles)) if lights_visible else surfaces
-        first = {"surface": surface_mesh(scene, shown, albedo_only=True)} if len(shown) else {}
+        self.shown = np.arange(len(scene.triangles)) if lights_visible else surfaces
+        first = {"surface": surface_mesh(scene, self.shown, albedo_only=True)} if len(self.shown) else {}
         self.first_hit_scene = mi.load_dict({"type": "scene", **first})
 
-    def sample(self, resolution: int, first: int, spp: int, seed: int, views: list[int], max_depth: int) -> list[Sums]:
-        """Sums of each view over ``spp`` paths per pixel, the ones from ``first`` on. A light gets its share of them, first
-        hits and direct light all; a light's sum is scaled up to ``spp``."""
-        count = self.record.n_lights
+    def sample(self, views: list[int], streams: list[int], first: int, spp: int) -> list[list[Sums]]:
+        """Per stream, the sums of each view over ``spp`` paths per pixel, the stream's ones from ``first`` on. A light gets
+        its share of them, first hits and direct light all; a light's sum is scaled up to ``spp``."""
+        return [self._sample(views, stream, first, spp) for stream in streams]
+
+    def _sample(self, views: list[int], stream: int, first: int, spp: int) -> list[Sums]:
+        count, resolution = self.record.n_lights, self.resolution
         share = self.light_spp(spp)
         shape = (resolution, resolution, 3)
         lights = np.zeros((len(views), count, *shape))
@@ -58,22 +61,25 @@ class ScalarRenderer:
 
         def trace(sensor, depth: int, samples: int, *where: int) -> np.ndarray:
             integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": not self.lights_visible})
-            image = mi.render(self.scene, sensor=sensor, integrator=integrator, spp=samples, seed=_seed(seed, *where, first))
+            seed = _seed(self.seed, *where, stream, first)
+            image = mi.render(self.scene, sensor=sensor, integrator=integrator, spp=samples, seed=seed)
             return np.array(image, np.float64)[..., :3] * spp
 
         for light in range(count):
             if self._switch_on([light]):
                 for row, view in enumerate(views):
-                    lights[row, light] = trace(sensors[row], max_depth, share, view, light)
+                    lights[row, light] = trace(sensors[row], self.max_depth, share, view, light)
         if self._switch_on(range(count)):
             for row, view in enumerate(views):
-                direct[row] = trace(sensors[row], min(2, max_depth), spp, view, count)
+                direct[row] = trace(sensors[row], min(2, self.max_depth), spp, view, count)
         sums = []
         for row, view in enumerate(views):
-            hit = self._first_hits(sensors[row], view, resolution, spp, _seed(seed, view, count + 1, first))
-            albedo, normal, depth, coverage, nearest = (np.asarray(values, np.float64) for values in hit)
+            hit = self._first_hits(sensors[row], view, spp, _seed(self.seed, view, count + 1, stream, first))
+            albedo, normal, depth, coverage = (np.asarray(values, np.float64) for values in hit)
             hits = coverage * spp
-            sums.append(Sums(spp, lights[row], direct[row], albedo * spp, normal * spp, depth * hits, hits, float(nearest)))
+            nearest = np.where(hits > 0, depth, np.inf)
+            triangle = self._triangles(view)
+            sums.append(Sums(spp, lights[row], direct[row], albedo * spp, normal * spp, depth * hits, hits, nearest, triangle))
         return sums
 
     def light_spp(self, spp: int) -> int:
@@ -113,8 +119,8 @@ class ScalarRenderer:
             }
         )
 
-    def _first_hits(self, sensor: mi.Sensor, view: int, resolution: int, spp: int, seed: int) -> tuple[np.ndarray, ...]:
-        """albedo, normal, depth, coverage and the nearest pixel's depth."""
+    def _first_hits(self, sensor: mi.Sensor, view: int, spp: int, seed: int) -> tuple[np.ndarray, ...]:
+        """albedo, normal, depth and coverage."""
         integrator = mi.load_dict(
             {
                 "type": "aov",
@@ -125,14 +131,25 @@ class ScalarRenderer:
         image = np.array(mi.render(self.first_hit_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed), np.float32)
         coverage, albedo, normal, depth = image[..., 3], image[..., 4:7], image[..., 7:10], image[..., 10]
         depth = np.where(coverage > 0, depth / np.maximum(coverage, 1e-6), 0)
-        nearest = float(depth[coverage > 0].min(initial=np.inf))
         # Normals are turned to the viewer, as the two-sided material does.
-        away = (normal * self._directions(view, resolution)).sum(axis=-1, keepdims=True) > 0
-        return albedo, np.where(away, -normal, normal), depth, coverage, nearest
+        away = (normal * self._directions(view)).sum(axis=-1, keepdims=True) > 0
+        return albedo, np.where(away, -normal, normal), depth, coverage
 
-    def _directions(self, view: int, resolution: int) -> np.ndarray:
+    def _triangles(self, view: int) -> np.ndarray:
+        """(H, W) int32 triangle at the pixel centres."""
+        origin = mi.ScalarPoint3f(self.record.camera_to_world[view, :3, 3].astype(np.float64))
+        directions = self._directions(view)
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        hits = np.full(directions.shape[:2], -1, np.int32)
+        if len(self.shown):
+            for row, column in np.ndindex(hits.shape):
+                found = self.first_hit_scene.ray_intersect_preliminary(mi.Ray3f(origin, mi.Vector3f(directions[row, column])))
+                hits[row, column] = self.shown[found.prim_index] if found.is_valid() else -1
+        return hits
+
+    def _directions(self, view: int) -> np.ndarray:
         """(H, W, 3) unnormalised directions of the rays through the pixel centres, world space."""
-        centre = (np.arange(resolution) + 0.5) / resolution - 0.5
+        centre = (np.arange(self.resolution) + 0.5) / self.resolution - 0.5
         focal = 0.5 / np.tan(0.5 * np.radians(float(self.record.fov_deg[view])))
         x, y = np.meshgrid(centre, -centre)
         return np.stack([x, y, np.full_like(x, -focal)], axis=-1) @ self.record.camera_to_world[view, :3, :3].T

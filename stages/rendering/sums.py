@@ -14,7 +14,8 @@ class Sums:
     """Sums over ``spp`` samples per pixel of one view, float64. ``a + b`` is the view from the samples of both.
 
     lights (L, H, W, 3), direct, albedo, normal (H, W, 3); distance (H, W) over the samples that hit something, hits (H, W)
-    their number; nearest: the smallest distance of all.
+    their number. Not sums: nearest (H, W), the smallest distance, infinite where nothing was hit; triangle (H, W) int32, what
+    the first sample hit, -1 for nothing.
     """
 
     spp: int
@@ -24,18 +25,21 @@ class Sums:
     normal: np.ndarray
     distance: np.ndarray
     hits: np.ndarray
-    nearest: float
+    nearest: np.ndarray
+    triangle: np.ndarray
 
     def __add__(self, other: Sums) -> Sums:
-        total = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self) if f.name != "nearest"}
-        return Sums(**total, nearest=min(self.nearest, other.nearest))
+        summed = [f.name for f in fields(self) if f.name not in ("nearest", "triangle")]
+        total = {name: getattr(self, name) + getattr(other, name) for name in summed}
+        return Sums(**total, nearest=np.minimum(self.nearest, other.nearest), triangle=self.triangle)
 
-    def view(self) -> ViewRecord:
-        """The means, without meta."""
+    def view(self, object_index: np.ndarray) -> ViewRecord:
+        """The means, without meta; ``object_index`` (F,) is the scene's."""
 
         def mean(values: np.ndarray) -> np.ndarray:
             return (values / self.spp).astype(np.float32)
 
         depth = np.where(self.hits > 0, self.distance / np.maximum(self.hits, 1e-9), 0).astype(np.float32)
         means = [mean(values) for values in (self.lights, self.direct, self.albedo, self.normal)]
-        return ViewRecord(*means, depth, mean(self.hits))
+        found = np.where(self.triangle >= 0, object_index[self.triangle], -1).astype(np.int32)
+        return ViewRecord(*means, depth, mean(self.hits), self.triangle.astype(np.int32), found)

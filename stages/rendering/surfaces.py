@@ -62,7 +62,7 @@ def surface_mesh(scene: SceneRecord, faces: np.ndarray, bsdf: mi.BSDF | None = N
             "alpha": np.maximum(scene.roughness[faces] ** 2, MIN_ALPHA),
         }
     for name, values in attributes.items():
-        mesh.add_attribute(f"face_{name}", values.shape[1] if values.ndim > 1 else 1, _floats(values))
+        mesh.add_attribute(f"face_{name}", values.shape[1] if values.ndim > 1 else 1, floats(values))
     return mesh
 
 
@@ -78,10 +78,10 @@ def mesh_of(
     count = len(triangles)
     mesh = mi.Mesh("triangles", 3 * count, count, props=props, has_vertex_normals=normals is not None)
     params = mi.traverse(mesh)
-    params["vertex_positions"] = _floats(triangles)
+    params["vertex_positions"] = floats(triangles)
     params["faces"] = np.arange(3 * count, dtype=np.uint32) if _scalar() else mi.UInt32(np.arange(3 * count, dtype=np.uint32))
     if normals is not None:
-        params["vertex_normals"] = _floats(normals)
+        params["vertex_normals"] = floats(normals)
     params.update()
     return mesh
 
@@ -90,6 +90,6 @@ def _scalar() -> bool:
     return mi.variant().startswith("scalar")
 
 
-def _floats(values: np.ndarray):
+def floats(values: np.ndarray):
     flat = np.ascontiguousarray(values, dtype=np.float32).reshape(-1)
     return flat if _scalar() else dr.auto.ad.Float(flat)

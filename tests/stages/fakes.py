@@ -99,6 +99,7 @@ def dataset_inputs(path: Path, train: int = 6, test: int = 2, size: int = 12) ->
             lights = rng.uniform(0, 2, (scene.n_lights, size, size, 3)).astype(np.float16).astype(np.float32)
             planes = {name: rng.uniform(size=(size, size, 3)).astype(np.float32) for name in ("direct", "albedo", "normal")}
             flat = {name: np.ones((size, size), np.float32) for name in ("depth", "coverage")}
+            flat |= {name: np.zeros((size, size), np.int32) for name in ("triangle", "object")}
             members[f"view{index}.exr"] = encode_view(ViewRecord(lights, **planes, **flat, meta={"index": index, "spp": 1}))
         members["meta.json"] = pack_json({"views": [{"index": index, "status": "ok"} for index in range(4)]})
         renders.append((item.group, Record(item.id, members)))

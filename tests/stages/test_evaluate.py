@@ -165,7 +165,10 @@ def shard_record(name: str, rng: np.random.Generator, cameras: list[int], lights
     for camera in cameras:
         layers = (base + hdr(rng, lights, SIZE, SIZE, 3) * 0.1).astype(np.float32) / lights
         flat = np.zeros((SIZE, SIZE, 3), np.float32)
-        view = ViewRecord(layers, layers.sum(axis=0) * 0.6, flat, flat, flat[..., 0], flat[..., 0], {"index": camera})
+        nothing = np.full(layers.shape[1:3], -1, np.int32)
+        view = ViewRecord(
+            layers, layers.sum(axis=0) * 0.6, flat, flat, flat[..., 0], flat[..., 0], nothing, nothing, {"index": camera}
+        )
         members[f"view{camera}.exr"] = encode_view(view)
     return Record(name, members)
 

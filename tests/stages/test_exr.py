@@ -20,6 +20,8 @@ def a_view(lights: int = 10, size: int = 6) -> ViewRecord:
         rng.uniform(-1, 1, (*image, 3)).astype(np.float32),
         rng.uniform(0, 3, image).astype(np.float32),
         rng.uniform(0, 1, image).astype(np.float32),
+        rng.integers(-1, 100_000, image).astype(np.int32),
+        rng.integers(-1, 9, image).astype(np.int32),
         {"index": 2, "status": "ok"},
     )
 
@@ -32,6 +34,8 @@ def test_view_survives_as_half_floats(lights):
         expected = getattr(view, name).astype(np.float16).astype(np.float32)
         assert getattr(back, name).dtype == np.float32
         assert np.array_equal(getattr(back, name), expected), name
+    for name in ("triangle", "object"):
+        assert getattr(back, name).dtype == np.int32 and np.array_equal(getattr(back, name), getattr(view, name)), name
     assert back.meta == view.meta
 
 

@@ -148,9 +148,9 @@ def test_white_furnace(backend, diffuse, specular, roughness):
 
 
 def cast(triangles, origin, directions):
-    """Whether each ray hits any triangle (Moeller and Trumbore), the slow obvious way."""
-    hit = np.zeros(directions.shape[:-1], bool)
-    for a, b, c in triangles.astype(np.float64):
+    """The triangle that each ray hits first, -1 for none (Moeller and Trumbore), the slow obvious way."""
+    found, nearest = np.full(directions.shape[:-1], -1), np.full(directions.shape[:-1], np.inf)
+    for index, (a, b, c) in enumerate(triangles.astype(np.float64)):
         p = np.cross(directions, c - a)
         determinant = p @ (b - a)
         safe = np.where(abs(determinant) < 1e-12, 1, determinant)
@@ -158,22 +158,28 @@ def cast(triangles, origin, directions):
         q = np.cross(origin - a, b - a)
         v = directions @ q / safe
         t = (c - a) @ q / safe
-        hit |= (abs(determinant) >= 1e-12) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
-    return hit
+        hit = (abs(determinant) >= 1e-12) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < nearest)
+        found, nearest = np.where(hit, index, found), np.where(hit, t, nearest)
+    return found
 
 
-def test_coverage_is_a_ray_cast_of_the_triangles(backend):
+def test_coverage_and_triangles_are_a_ray_cast(backend):
     scene, size = clutter(), 24
+    scene.object_index = np.arange(len(scene.triangles), dtype=np.int16) // 2
     view = render_views(scene, size, max_spp=32, seed=0, backend=backend, denoise=False, views=[1])[0]
     half = np.tan(np.radians(scene.fov_deg[1] / 2))
     x, y = np.meshgrid((2 * np.arange(size) + 1) / size - 1, 1 - (2 * np.arange(size) + 1) / size)
     local = np.stack([x * half, y * half, -np.ones_like(x)], axis=-1)
     pose = scene.camera_to_world[1].astype(np.float64)
-    hit = cast(scene.triangles[scene.light_index < 0], pose[:3, 3], local @ pose[:3, :3].T)
+    found = cast(scene.triangles[scene.light_index < 0], pose[:3, 3], local @ pose[:3, :3].T)
+    hit = found >= 0
     sure = (view.coverage == 0) | (view.coverage == 1)
     assert sure.mean() > 0.7
     assert np.array_equal(view.coverage[sure] == 1, hit[sure])
     assert ((view.depth > 0) == (view.coverage > 0)).all()
+    assert np.array_equal(view.triangle[view.coverage == 0], found[view.coverage == 0])
+    assert np.mean(view.triangle == found) > 0.9  # a sample somewhere in the pixel, and the pixel's centre
+    assert np.array_equal(view.object, np.where(view.triangle >= 0, view.triangle // 2, -1))
     lit = view.image[view.coverage == 0].any(axis=-1).sum()
     assert lit <= (3 if backend == SCALAR else 0)  # the scalar renderer's first hits are other samples than its light
 
@@ -311,12 +317,41 @@ def test_samples_are_spent_until_the_target_is_met(backend):
 
 
 def test_samples_in_portions_are_the_same_samples(jit):
-    scene, kept = clutter(), {"seed": 4, "backend": jit, "denoise": False, "max_spp": 64}
-    whole, portions = (render_views(scene, 16, target_error=target, **kept) for target in (0, 1e-9))
-    for a, b in zip(whole, portions, strict=True):
-        for name in ("lights", "direct", "albedo", "normal", "depth", "coverage"):
-            np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=1e-7)
-        assert a.meta["nearest"] == b.meta["nearest"]
+    from stages.rendering.jit import JitRenderer, Limits
+
+    backends.activate(jit)
+    renderer = JitRenderer(clutter(), 16, 4, Limits(8), False)
+    whole = renderer.sample([0, 1], [0, 1], 0, 32)
+    portions = [renderer.sample([0, 1], [0, 1], first, 16) for first in (0, 16)]
+    assert not np.array_equal(whole[0][0].lights, whole[1][0].lights)
+    for stream in (0, 1):
+        for view in (0, 1):
+            a, b = whole[stream][view], portions[0][stream][view] + portions[1][stream][view]
+            for name in vars(a):
+                np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-12)
+
+
+def test_sampler_fills_every_pair_of_dimensions_evenly(jit):
+    """Any 2^k first points of a key have one in each of the 2^k boxes of every shape: a (0, 2)-sequence in base 2."""
+    backends.activate(jit)
+    import drjit as dr
+    import mitsuba as mi
+
+    from stages.rendering.sobol import Sampler
+
+    index = dr.arange(mi.UInt32, 256)
+    other = None
+    for key, dimension in ((1, 0), (1, 7), (987654321, 0xFFFFFFFF)):
+        points = Sampler(mi.UInt32(key), index).two(mi.UInt32(dimension)).numpy()
+        line = Sampler(mi.UInt32(key), index).one(mi.UInt32(dimension)).numpy()
+        assert points.shape == (2, 256) and (points >= 0).all() and (points < 1).all()
+        for k in range(9):
+            assert len(np.unique(np.floor(line[: 2**k] * 2**k))) == 2**k
+            for split in range(k + 1):
+                boxes = np.floor(points[:, : 2**k] * np.array([[2**split], [2 ** (k - split)]]))
+                assert len(np.unique(boxes, axis=1).T) == 2**k, (k, split)
+        assert other is None or np.abs(np.corrcoef(np.vstack([points, line, other]))[:3, 3:]).max() < 0.3
+        other = points
 
 
 def test_raw_error_estimate_is_the_error(backend):
