@@ -93,11 +93,21 @@ class Cameras:
         return low + (high - low) * (u - mi.Float(cell))
 
 
+class Points:
+    """Rays that end at given points from ``height`` above them: (N, 3) points and unit normals on the side that is asked."""
+
+    def __init__(self, points: np.ndarray, normals: np.ndarray, height: float):
+        self.origins, self.directions = floats(points + height * normals), floats(-normals)
+
+    def ray(self, pixel: mi.UInt32, u: mi.Point2f) -> mi.Ray3f:
+        return mi.Ray3f(dr.gather(mi.Point3f, self.origins, pixel), dr.gather(mi.Vector3f, self.directions, pixel))
+
+
 @dataclass
 class Lanes:
     """What the lanes of a kernel trace: where their rays start, and which samples."""
 
-    start: Cameras
+    start: Cameras | Points
     pixel: mi.UInt32
     key: mi.UInt32  # of the random numbers
     first: mi.UInt32  # number of the first sample
@@ -109,11 +119,12 @@ def _add(slots: list, slot: mi.Int32, value: mi.Color3f) -> list:
 
 
 @dr.syntax
-def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide):
+def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide, diffuse_start):
     """Sums over the samples of each lane: (light slots, direct, albedo, normal, distance, hits, nearest distance, triangle).
 
     ``limits``: opaque (bounces, diffuse bounces, glossy bounces, indirect clamp on the sum over RGB). ``hide``: opaque
     bool, camera rays pass through lights. The triangle is that of the first sample, -1 where it hit nothing.
+    ``diffuse_start``: the first surface is a white diffuse one, whatever its material.
     """
     max_bounces, max_diffuse, max_glossy, clamp = limits
     context = mi.BSDFContext()
@@ -177,6 +188,10 @@ def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide):
         density = dr.gather(mi.Float, lights.density, lit)
         sampled = surface & (cosine > 0) & (distance2 > 0) & (density > 0)
         reflected, pdf = bsdf.eval_pdf(context, si, si.to_local(to_light), sampled)
+        if diffuse_start:
+            # cosine over pi on the side of the viewer is both the white material times the cosine and its density
+            lambert = dr.maximum(dr.dot(si.sh_frame.n, to_light) * facing, 0) * dr.inv_pi
+            reflected, pdf = dr.select(bounce == 0, lambert, reflected), dr.select(bounce == 0, lambert, pdf)
         sampled &= dr.max(reflected) > 0
         sampled &= ~scene.ray_test(shadow, sampled)
         light_pdf = density * distance2 / dr.maximum(cosine, 1e-9)
@@ -186,7 +201,14 @@ def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide):
         direct += dr.select(bounce == 0, value, 0)
 
         # The next direction, from the material.
-        sample, scattered = bsdf.sample(context, si, choice.y, sampler.two(dimension + DIRECTION), surface)
+        spot = sampler.two(dimension + DIRECTION)
+        sample, scattered = bsdf.sample(context, si, choice.y, spot, surface)
+        if diffuse_start:
+            wo = mi.warp.square_to_cosine_hemisphere(spot)
+            wo.z = wo.z * facing
+            sample.wo = dr.select(bounce == 0, wo, sample.wo)
+            sample.pdf = dr.select(bounce == 0, dr.abs(wo.z) * dr.inv_pi, sample.pdf)
+            scattered = dr.select(bounce == 0, 1, scattered)
         is_glossy = mi.has_flag(sample.sampled_type, mi.BSDFFlags.GlossyReflection)
         glossy += dr.select(surface & is_glossy, 1, 0)
         diffuse += dr.select(surface & ~is_glossy, 1, 0)
@@ -233,6 +255,16 @@ class JitRenderer:
         self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
         self.cameras = Cameras(scene, resolution, limits.filter)
 
+    def texel_sums(self, points: np.ndarray, normals: np.ndarray, height: float, spp: int) -> dict[str, np.ndarray]:
+        """Light that arrives at (N, 3) points, as seen from their normals' side on white diffuse material.
+
+        Sums over ``spp`` samples: ``lights`` (N, L, 3); and ``triangle`` (N,), which ``height`` above the point is met first.
+        """
+        start, ids = Points(points, normals, height), np.arange(len(points))
+        passes = [self._pass(table, number, start, ids, [0], 0, spp) for number, table in enumerate(self.passes)]
+        lights = np.concatenate([p["lights"][0] for p in passes], axis=-2)[:, : self.record.n_lights]
+        return {"lights": lights, "triangle": passes[0]["triangle"][0]}
+
     def sample(self, views: list[int], streams: list[int], first: int, spp: int) -> list[list[Sums]]:
         """Per stream, the sums of each view over the stream's samples ``first`` to ``first + spp`` of every pixel.
 
@@ -240,7 +272,7 @@ class JitRenderer:
         """
         pixels = self.resolution * self.resolution
         ids = np.concatenate([view * pixels + np.arange(pixels) for view in views])
-        passes = [self._pass(table, number, ids, streams, first, spp) for number, table in enumerate(self.passes)]
+        passes = [self._pass(table, number, self.cameras, ids, streams, first, spp) for number, table in enumerate(self.passes)]
         shape = (len(streams), len(views), self.resolution, self.resolution)
         lights = np.concatenate([p["lights"] for p in passes], axis=-2)[..., : self.record.n_lights, :]
         hit = passes[0]  # the camera rays of all passes are the same
@@ -253,7 +285,14 @@ class JitRenderer:
         ]
 
     def _pass(
-        self, table: LightTable, number: int, ids: np.ndarray, streams: list[int], first: int, spp: int
+        self,
+        table: LightTable,
+        number: int,
+        rays: Cameras | Points,
+        ids: np.ndarray,
+        streams: list[int],
+        first: int,
+        spp: int,
     ) -> dict[str, np.ndarray]:
         """(streams, pixels, ..) sums over the samples, float64; ``lights`` (.., SLOTS, 3)."""
         blocks = -(-spp // BLOCK)
@@ -264,7 +303,7 @@ class JitRenderer:
             row, block = lane // blocks, lane % blocks
             stream = np.asarray(streams)[row // len(ids)]
             counts = np.minimum(BLOCK, spp - block * BLOCK)
-            values = self._chunk(table, number, ids[row % len(ids)], stream, first + block * BLOCK, counts)
+            values = self._chunk(table, number, rays, ids[row % len(ids)], stream, first + block * BLOCK, counts)
             for name, value in values.items():
                 results.setdefault(name, []).append(value)
         whole = {name: np.concatenate(parts, axis=-1) for name, parts in results.items()}
@@ -277,7 +316,14 @@ class JitRenderer:
         return sums | {"nearest": shaped(whole["nearest"]).min(axis=2), "triangle": shaped(whole["triangle"])[:, :, 0]}
 
     def _chunk(
-        self, table: LightTable, number: int, pixel: np.ndarray, stream: np.ndarray, first: np.ndarray, count: np.ndarray
+        self,
+        table: LightTable,
+        number: int,
+        rays: Cameras | Points,
+        pixel: np.ndarray,
+        stream: np.ndarray,
+        first: np.ndarray,
+        count: np.ndarray,
     ) -> dict[str, np.ndarray]:
         """Every lane's sums, (.., lanes) float32."""
 
@@ -287,7 +333,7 @@ class JitRenderer:
         ids, streams = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(stream.astype(np.uint32))
         # one to one in the pixel for a given seed, so no two pixels of a scene share their numbers
         key = mixed(mixed(mixed(ids + opaque(self.seed)) + opaque(self.seed >> 32)) + streams)
-        lanes = Lanes(self.cameras, ids, key, mi.UInt32(first.astype(np.uint32)), mi.UInt32(count.astype(np.uint32)))
+        lanes = Lanes(rays, ids, key, mi.UInt32(first.astype(np.uint32)), mi.UInt32(count.astype(np.uint32)))
         limits = self.limits
         bounds = (
             opaque(limits.bounces),
@@ -296,7 +342,9 @@ class JitRenderer:
             dr.opaque(mi.Float, 3 * limits.indirect_clamp),
         )
         hide = dr.opaque(mi.Bool, not self.lights_visible)
-        out = trace_paths(self.scene, table, self.albedo, lanes, opaque(number * 0x5851F42D), bounds, hide)
+        pass_key = opaque(number * 0x5851F42D)
+        white = isinstance(rays, Points)
+        out = trace_paths(self.scene, table, self.albedo, lanes, pass_key, bounds, hide, white)
         dr.eval(out)
         slots, *wide, distances, hits, nearest, triangle = out
         size = len(pixel)

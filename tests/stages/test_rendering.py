@@ -483,3 +483,27 @@ def test_trace_writes_one_file_per_view(tmp_path, shared_data, monkeypatch):
     ):
         with pytest.raises(UserError, match=message):
             trace(**{"scene_path": scene, "out_path": tmp_path / "b.exr", "resolution": 8, **arguments})
+
+
+def test_radiance_at_texels_is_what_a_camera_sees_of_diffuse_surfaces(jit):
+    from stages.rendering.texels import texel_radiance, texel_weights
+
+    kept, weights = texel_weights(32)
+    assert kept.sum() == len(weights) == 528 + 31 and np.allclose(weights.sum(axis=1), 1)
+    scene = clutter(lights=2, cameras=1)
+    scene.specular[:2] = 0  # the floor
+    radiance, met = texel_radiance(scene, [0, 1, 4, len(scene.triangles) - 1], spp=64, seed=0, backend=jit, size=16)
+    assert radiance.shape == (4, 2, 16, 16, 3) and met[:2].sum() == 2 * texel_weights(16)[0].sum()
+    assert not radiance[:, :, ~texel_weights(16)[0]].any() and not radiance[3].any() and not met[3].any()
+    # against a camera that looks straight down at a few texels of the floor
+    for row, column in ((2, 3), (8, 5), (1, 12)):
+        one, two = (column + 0.5) / 16, (row + 0.5) / 16
+        point = np.array([1 - one - two, one, two]) @ scene.triangles[0].astype(np.float64)
+        above = clutter(lights=2, cameras=1)
+        above.specular[:2] = 0
+        above.camera_to_world = np.float32([camera(point + (0, 0, 0.01), point, (0, 1, 0))])
+        above.fov_deg = np.float32([1])
+        view = render_views(above, 8, max_spp=256, seed=1, backend=jit, denoise=False)[0]
+        np.testing.assert_allclose(radiance[0, :, row, column], view.lights.mean(axis=(1, 2)), rtol=0.1)
+    with pytest.raises(UserError, match="JIT"):
+        texel_radiance(scene, [0], spp=1, seed=0, backend=SCALAR)

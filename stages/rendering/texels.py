@@ -1,0 +1,62 @@
+"""Outgoing diffuse radiance at the texel centres of triangles: what a triangle token should know of its own light
+(paper, section 4.1 and figure 7).
+
+Texels are those of the triangle patches (``SceneRecord.patches``): row and column count along the edges from corner 0 to
+corner 2 and to corner 1, and cells with row + column > P stay 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import UserError
+from stages.records import SceneRecord
+from stages.rendering import backend as backends
+
+HEIGHT = 1e-4  # scene units above a surface from where it is looked at
+INSET = 1e-3  # least barycentric weight of a point: edges belong to nobody
+
+
+def texel_weights(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Kept cells (P, P) bool, and the barycentric weights (kept, 3) of their centres.
+
+    The centres of the last diagonal, row + column = P, lie just outside and are moved to the edge.
+    """
+    row, column = np.indices((size, size))
+    kept = row + column <= size
+    one, two = (column[kept] + 0.5) / size, (row[kept] + 0.5) / size
+    weights = np.maximum(np.stack([1 - one - two, one, two], axis=1), INSET)
+    return kept, weights / weights.sum(axis=1, keepdims=True)
+
+
+def texel_radiance(
+    scene: SceneRecord, triangles: Sequence[int], *, spp: int, seed: int, backend: dict[str, Any], size: int = 32
+) -> tuple[np.ndarray, np.ndarray]:
+    """Per light, the radiance that leaves the front of ``triangles`` (T indices) by diffuse reflection.
+
+    Returns radiance (T, L, P, P, 3) float32, and (T, P, P) bool, which texels were met: a texel whose front another surface
+    covers within ``HEIGHT`` is not. A constant triangle's is its ``diffuse`` / pi times irradiance; needs a JIT backend.
+    """
+    from stages.rendering.jit import JitRenderer, Limits
+
+    backends.activate(backend)
+    if backend["backend"] == "scalar":
+        raise UserError("radiance at texels needs a JIT backend of Mitsuba, and none works here: " + backends.INSTALL)
+    faces = np.asarray(triangles, np.int64)
+    kept, weights = texel_weights(size)
+    corners = scene.triangles[faces].astype(np.float64)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
+    points = (weights @ corners).reshape(-1, 3)
+    renderer = JitRenderer(scene, 1, seed, Limits(33), lights_visible=True)
+    sums = renderer.texel_sums(points, np.repeat(normals, len(weights), axis=0), HEIGHT, spp)
+    met = (sums["triangle"].reshape(len(faces), -1) == faces[:, None]) & (scene.light_index[faces] < 0)[:, None]
+    arriving = sums["lights"].reshape(len(faces), len(weights), -1, 3) / spp * met[..., None, None]
+    radiance = np.zeros((len(faces), scene.n_lights, size, size, 3), np.float32)
+    radiance[:, :, kept] = np.moveaxis(arriving * scene.diffuse[faces][:, None, None], 2, 1)
+    valid = np.zeros((len(faces), size, size), bool)
+    valid[:, kept] = met
+    return radiance, valid
