@@ -7,9 +7,11 @@ is plain JSON, which the render stage records and passes to its workers.
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import glob
 import importlib
+import itertools
 import json
 import logging
 import os
@@ -17,8 +19,10 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
+import traceback
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from pipeline.errors import UserError
 
@@ -36,6 +40,8 @@ FOLDERS = (
     "/usr/local/opt/llvm*/lib",
 )
 INSTALL = "install libLLVM 16 or newer (Debian, Ubuntu: apt-get install libllvm19) for renders several times as fast"
+
+OUR_FAULT = 3  # exit status of a trial that failed by a mistake in this package
 
 log = logging.getLogger("lightmill")
 
@@ -59,13 +65,45 @@ def llvm_libraries() -> list[str]:
     return ([named] if named else []) + [path for path in ordered if path != named]
 
 
+def gpus() -> list[str]:
+    """NVIDIA GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if named is not None and named.strip() in ("", "-1"):
+        return []
+    if not shutil.which("nvidia-smi"):
+        return []
+    answer = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
+    found = re.findall(r"^GPU .*\(UUID: (\S+)\)", answer.stdout, re.MULTILINE) if answer.returncode == 0 else []
+    return named.split(",") if named and found else found
+
+
+_claims: list[IO] = []  # open lock files: a claim lasts as long as its process
+
+
+def claim_gpu() -> None:
+    """Keep this process to one GPU, the one that fewest render processes of this machine have claimed."""
+    here = gpus()
+    if len(here) < 2 or _claims:
+        return
+    folder = Path(tempfile.gettempdir()) / f"lightmill-gpus-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    for place, gpu in ((place, gpu) for place in itertools.count() for gpu in here):
+        file = (folder / f"{re.sub(r'[^A-Za-z0-9-]', '_', gpu)}.{place}").open("w")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+            continue
+        _claims.append(file)
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpu
+        return
+
+
 def candidates(choice: str) -> list[dict[str, Any]]:
     """Backends to try for a choice of the config, best first."""
     found: list[dict[str, Any]] = []
-    if choice in ("auto", "cuda") and shutil.which("nvidia-smi"):
-        answer = subprocess.run(["nvidia-smi", "-L"], capture_output=True, check=False)
-        if answer.returncode == 0 and b"GPU" in answer.stdout:
-            found.append({"backend": "cuda"})
+    if choice in ("auto", "cuda") and gpus():
+        found.append({"backend": "cuda"})
     if choice in ("auto", "llvm"):
         found += [{"backend": "llvm", "library": path} for path in llvm_libraries()]
     if choice in ("auto", "scalar"):
@@ -88,6 +126,8 @@ def _proof(candidate: str) -> bool:
     except subprocess.TimeoutExpired:
         log.info("renderer %s did not finish its trial within %g s", candidate, PROBE_SECONDS)
         return False
+    if child.returncode == OUR_FAULT:
+        raise RuntimeError(f"the renderer's trial failed by a mistake in lightmill:\n{child.stderr.decode(errors='replace')}")
     if child.returncode:
         log.info("renderer %s failed its trial: %s", candidate, child.stderr.decode(errors="replace").strip()[-300:])
     return child.returncode == 0
@@ -124,6 +164,8 @@ def activate(backend: dict[str, Any], threads: int | None = None) -> None:
     """Select the backend's Mitsuba variant in this process, with that many threads (None: all cores)."""
     if backend.get("library"):
         os.environ["DRJIT_LIBLLVM_PATH"] = backend["library"]  # read once, when Dr.Jit first compiles
+    if backend["backend"] == "cuda" and threads is not None:  # in a worker: others use the other GPUs
+        claim_gpu()
     mitsuba = importlib.import_module("mitsuba")
     drjit = importlib.import_module("drjit")
     if mitsuba.variant() != VARIANTS[backend["backend"]]:
@@ -168,4 +210,8 @@ def _trial(backend: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    _trial(json.loads(sys.argv[1]))
+    try:
+        _trial(json.loads(sys.argv[1]))
+    except (TypeError, NameError, AttributeError):
+        traceback.print_exc()
+        sys.exit(OUR_FAULT)
