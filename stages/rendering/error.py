@@ -1,20 +1,29 @@
 """How far a view is from the truth, told from its own samples: mean absolute difference of log10(1 + radiance).
 
 The samples come in two halves that share no path. Raw, the halves differ by twice the error of their mean, exactly in
-expectation. Denoised, the difference of the two holds the noise that gets through the denoiser but not its bias, which is
-the same in both; the two grow together, so one factor serves. It has not been calibrated on long references yet.
+expectation. Denoised, half their difference is the noise that got through the denoiser; its bias is the same in both, but
+shrinks with more samples, and shows in how far the image of all samples has moved away from the mean of the halves' images.
+The weights of the two were fitted to long references (docs/rendering.md has the scatter plot).
 """
 
 from __future__ import annotations
+
+import numpy as np
 
 from stages.metrics import log_error
 from stages.records import ViewRecord
 from stages.rendering.denoising import denoise
 
-DENOISED_FACTOR = 1.0  # true error of the whole over the difference of its denoised halves
+NOISE_WEIGHT = 0.5  # of the mean difference between the denoised halves
+DRIFT_WEIGHT = 1.6  # of the mean difference between their mean and the denoised whole
 
 
-def estimated_error(a: ViewRecord, b: ViewRecord, denoised: bool) -> float:
-    """Of the image with all lights on, from the views of both halves, not denoised."""
-    images = [denoise(v.image, v.albedo, v.normal, v.coverage) if denoised else v.image for v in (a, b)]
-    return log_error(*images) * (DENOISED_FACTOR if denoised else 0.5)
+def estimated_error(a: ViewRecord, b: ViewRecord, whole: ViewRecord, denoised: bool) -> float:
+    """Of the image with all lights on, from the views of both halves and of all samples, not yet denoised."""
+    if not denoised:
+        return 0.5 * log_error(a.image, b.image)
+    first, second, now = (
+        np.log10(1 + denoise(v.image, v.albedo, v.normal, v.coverage).astype(np.float64)) for v in (a, b, whole)
+    )
+    noise, drift = np.abs(first - second).mean(), np.abs((first + second) / 2 - now).mean()
+    return float(NOISE_WEIGHT * noise + DRIFT_WEIGHT * drift)

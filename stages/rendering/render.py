@@ -75,14 +75,15 @@ def render_views(
         taken += step
         left = []
         for view in active:
-            estimate = None
-            if len(streams) > 1:
-                estimate = estimated_error(*(half.view(scene.object_index) for half in halves[view].values()), denoise)
-            if taken < total and estimate > target_error:
+            parts = list(halves[view].values())
+            sums = functools.reduce(operator.add, parts)
+            seen, *others = (part.view(scene.object_index) for part in (sums, *parts))
+            estimate = estimated_error(*others, seen, denoise) if len(others) > 1 else None
+            if taken < total and estimate is not None and estimate > target_error:
                 left.append(view)
             else:
-                sums = functools.reduce(operator.add, halves.pop(view).values())
-                records[view] = _finish(sums, scene, view, denoise, estimate)
+                del halves[view]
+                records[view] = _finish(seen, sums, view, denoise, estimate)
         active, step = left, min(taken, total - taken)
     return [records[view] for view in order]
 
@@ -114,9 +115,8 @@ def _sampler(
     return JitRenderer(scene, resolution, seed, limits, lights_visible).sample
 
 
-def _finish(sums: Sums, scene: SceneRecord, index: int, denoise: bool, error: float | None) -> ViewRecord:
+def _finish(view: ViewRecord, sums: Sums, index: int, denoise: bool, error: float | None) -> ViewRecord:
     """The stored view: every light denoised on its own, and what is to be said of it."""
-    view = sums.view(scene.object_index)
     nearest = float(sums.nearest.min())
     if denoise:
 
