@@ -23,6 +23,7 @@ from stages.tonemap import clamp
 
 REWEIGHTINGS = 4  # of the lights of each pair
 LIGHTING = Relight(share=1.0, keep=0.5, scale=(0.5, 2.0), saturation=1.0)  # half of the lights off, the others in any colour
+DIGITS = {"log_error": 5, "psnr": 2}  # in the summary
 PERCENTS = (10, 50, 90)
 
 
@@ -63,15 +64,13 @@ def pair_error(a: ViewRecord, b: ViewRecord, rng: np.random.Generator) -> dict[s
 def noise_floor(pairs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Number of views, and the distributions of both errors over them, from what `pair_error` said of each."""
     errors = {"sum": [pair["sum"] for pair in pairs], "reweighted": [one for pair in pairs for one in pair["reweighted"]]}
-    return {
-        "views": len(pairs),
-        **{
-            name: {measure: _distribution([one[measure] for one in ones]) for measure in ("log_error", "psnr")}
-            for name, ones in errors.items()
-        },
+    distributions = {
+        name: {measure: _distribution([one[measure] for one in ones], digits) for measure, digits in DIGITS.items()}
+        for name, ones in errors.items()
     }
+    return {"views": len(pairs), **distributions}
 
 
-def _distribution(values: Sequence[float]) -> dict[str, float]:
-    percentiles = zip(PERCENTS, np.percentile(values, PERCENTS), strict=True)
-    return {"mean": round(float(np.mean(values)), 5), **{f"p{percent}": round(float(x), 5) for percent, x in percentiles}}
+def _distribution(values: Sequence[float], digits: int) -> dict[str, float]:
+    told = {"mean": np.mean(values)} | {f"p{percent}": np.percentile(values, percent) for percent in PERCENTS}
+    return {name: round(float(value), digits) for name, value in told.items()}
