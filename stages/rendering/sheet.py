@@ -83,7 +83,10 @@ def layer_sheet(template: str, kinds: Kinds, read: Read) -> Image.Image:
         id = max(metas, key=lambda id: (metas[id]["lights"] <= COLUMNS, metas[id]["lights"]))
         view = _view(id, next(meta["index"] for meta in metas[id]["views"] if meta["status"] == "ok"), read)
         exposure = exposure_for(view.image)
-        page.heading(f"{template}_{variant}", f"{id}, view {view.meta['index']}, {_exposure(exposure)}")
+        meta = view.meta
+        error = "" if meta["error"] is None else f", estimated error {meta['error']:.4f}"
+        note = f"{id}, view {meta['index']}, {meta['spp']} samples per pixel{error}, {_exposure(exposure)}"
+        page.heading(f"{template}_{variant}", note)
         for block in _layer_blocks(view, exposure):
             page.place(block)
     return page.image()
@@ -116,13 +119,12 @@ def _scene_block(id: str, read: Read) -> Image.Image:
 
 def _layer_blocks(view: ViewRecord, exposure: float) -> list[Image.Image]:
     """Two rows of tiles: what is seen, then the lights."""
-    meta, hit = view.meta, view.depth > 0
+    hit = view.depth > 0
     near, far = (float(f(view.depth[hit])) for f in (np.min, np.max)) if hit.any() else (0.0, 1.0)
     depth = np.where(hit, 1 - 0.85 * (view.depth - near) / max(far - near, 1e-6), 0)
     normal = 0.5 * (view.normal + view.coverage[..., None])  # black where nothing was hit
-    error = "" if meta["error"] is None else f", error {meta['error']:.4f}"
     blocks = [
-        _tile(to_picture(fit(view.image), exposure), f"{meta['spp']} spp{error}"),
+        _tile(to_picture(fit(view.image), exposure), "image"),
         _tile(to_picture(fit(view.direct), exposure), "direct light"),
         _tile(to_picture(fit(view.albedo)), "albedo"),
         _tile(_grey(fit(normal)), "normal, world"),
