@@ -4,17 +4,18 @@ Reads *scene*; writes per scene ``view<i>.exr`` for every kept camera i (layers:
 with what was noted of all cameras. One design choice: radiance is stored per light, as light transport is linear:
 the image under any other choice of intensities and colours is a weighted sum, at no rendering cost.
 
-As in the paper's data, views whose mean radiance is under 0.01 or whose nearest depth is under 0.01 are dropped.
+As in the paper's data, views whose mean radiance is under 0.01 or whose nearest depth is under 0.01 are dropped. Some of the
+kept ones, drawn by lot, are rendered a second time: the pairs tell the noise floor (``stages.rendering.noise``).
 """
 
 from __future__ import annotations
 
 import os
+from array import array
 from collections import Counter
 from collections.abc import Iterator
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 from pydantic import Field
 
 from pipeline.config import StageConfig, runtime
@@ -22,18 +23,20 @@ from pipeline.errors import Reject
 from pipeline.keys import seed_for
 from pipeline.stage import Inputs, Item, MapStage, Record
 
-SHEET_SCENES = 12  # rows of a contact sheet
+if TYPE_CHECKING:
+    from stages.records import ViewRecord
 
 
 class RenderConfig(StageConfig):
     seed: int = 0
     resolution: int = Field(64, ge=8, le=4096)  # pixels per side; the paper: 256, then 512
-    target_error: float = Field(0.0, ge=0)  # of the stored image, mean absolute log10(1 + x), estimated; 0: max_spp at once
-    max_spp: int = Field(16, ge=1, le=65536)  # camera paths per pixel, shared by all lights, at most
+    target_error: float = Field(0.002, ge=0)  # of the stored image, mean absolute log10(1 + x), estimated; 0: max_spp at once
+    max_spp: int = Field(4096, ge=1, le=65536)  # camera paths per pixel, shared by all lights, at most
     mode: Literal["physical", "cycles"] = "physical"  # cycles: Blender Cycles' defaults, as far as they can be matched
     max_depth: int = Field(34, ge=2)  # longest path in segments: 34 is 32 bounces besides direct light
     denoise: bool = True  # Open Image Denoise, every light on its own
     lights_visible: bool = False  # whether cameras see lights; reflections always do
+    noise_share: float = Field(0.01, ge=0, le=1)  # of the views, rendered twice to tell the dataset's noise floor
     backend: Literal["auto", "cuda", "llvm", "scalar"] = runtime("auto")  # auto: the best that works here
 
 
@@ -48,7 +51,7 @@ class RenderWorker:
 
 class Render(MapStage):
     name = "render"
-    version = 2
+    version = 3
     inputs = ("scene",)
     Config = RenderConfig
     reasons = {
@@ -79,69 +82,76 @@ class Render(MapStage):
         from stages.arrays import pack_json
         from stages.exr import encode_view
         from stages.records import SceneRecord
+        from stages.rendering.noise import add_pairs
         from stages.rendering.render import render_views
 
         config = worker.config
-        views = render_views(
-            SceneRecord.from_record(worker.scenes.read(item.id)),
-            config.resolution,
-            max_spp=config.max_spp,
-            target_error=config.target_error,
-            seed=seed_for(config.seed, self.name, item.id),
-            backend=worker.backend,
-            mode=config.mode,
-            max_depth=config.max_depth,
-            denoise=config.denoise,
-            lights_visible=config.lights_visible,
-            threads=worker.threads,
-        )
+        scene = SceneRecord.from_record(worker.scenes.read(item.id))
+
+        def render(seed: int, views: list[int] | None = None) -> list[ViewRecord]:
+            return render_views(
+                scene,
+                config.resolution,
+                max_spp=config.max_spp,
+                target_error=config.target_error,
+                seed=seed,
+                backend=worker.backend,
+                views=views,
+                mode=config.mode,
+                max_depth=config.max_depth,
+                denoise=config.denoise,
+                lights_visible=config.lights_visible,
+                threads=worker.threads,
+            )
+
+        views = render(seed_for(config.seed, self.name, item.id))
         statuses = Counter(view.meta["status"] for view in views)
         if not statuses["ok"]:
             reason = next(iter(statuses)) if len(statuses) == 1 else "no_view_left"
             raise Reject(reason, ", ".join(f"{count} {status}" for status, count in sorted(statuses.items())) or "no camera")
-        members = {"meta.json": pack_json({"views": [view.meta for view in views]})}
+        seed = seed_for(config.seed, f"{self.name}/noise", item.id)
+        add_pairs(views, lambda indices: render(seed, indices), seed, config.noise_share)
+        meta = {"template": scene.meta["template"], "variant": scene.meta["variant"], "lights": scene.n_lights}
+        members = {"meta.json": pack_json({**meta, "views": [view.meta for view in views]})}
         members |= {f"view{view.meta['index']}.exr": encode_view(view) for view in views if view.meta["status"] == "ok"}
         yield Record(item.id, members)
 
     def finish(self, config: RenderConfig, inputs: Inputs, draft: Any) -> None:
-        """``files/contact-<split>.png``, a row per scene, a column per camera; and counts of views in the manifest."""
+        """Contact sheets (``stages.rendering.sheet``); views, samples and the noise floor in the manifest.
+
+        One pass over the records' small ``meta.json``; images are read of the scenes on the sheets alone.
+        """
         from stages.arrays import unpack_json
+        from stages.geometry.catalogue import spread
+        from stages.rendering.noise import noise_floor
+        from stages.rendering.sheet import write_sheets
 
         statuses: Counter[str] = Counter()
-        clamped = 0
-        groups: dict[str, list[str]] = {}
+        clamped = over = 0
+        samples, errors = array("q"), array("d")  # of the kept views: compact, there may be millions
+        pairs: list[dict[str, Any]] = []
+        scenes: dict[tuple[str, str], list[str]] = {}
         for row in draft.rows():
-            groups.setdefault(row.group, []).append(row.id)
-            for view in unpack_json(draft.read(row.id).members["meta.json"])["views"]:
+            meta = unpack_json(draft.read(row.id, ("meta.json",)).members["meta.json"])
+            scenes.setdefault((meta["template"], meta["variant"]), []).append(row.id)
+            for view in meta["views"]:
                 statuses[view["status"]] += 1
                 clamped += view["clamped"]
+                if view["status"] == "ok":
+                    samples.append(view["spp"])
+                    if view["error"] is not None:
+                        errors.append(view["error"])
+                        over += view["error"] > config.target_error > 0
+                if "noise" in view:
+                    pairs.append(view["noise"])
         draft.note("views", {**{status: statuses[status] for status in ("ok", "dark", "too_close")}, "clamped_values": clamped})
-        for group, ids in sorted(groups.items()):
-            step = max(1, len(ids) // SHEET_SCENES)
-            chosen = [draft.read(id) for id in ids[::step][:SHEET_SCENES]]
-            contact_sheet(chosen).save(draft.files / f"contact-{group or 'all'}.png")
-
-
-def contact_sheet(records: list[Record]) -> Any:
-    """Views of rendered scenes as one sRGB picture, every scene with its own exposure; dropped views are grey."""
-    from PIL import Image
-
-    from stages.arrays import unpack_json
-    from stages.exr import decode_view
-    from stages.tonemap import exposure_for, to_picture
-
-    rows = []
-    for record in records:
-        views = unpack_json(record.members["meta.json"])["views"]
-        names = [f"view{view['index']}.exr" for view in views]
-        images = {name: decode_view(record.members[name]).image for name in names if name in record.members}
-        exposure = exposure_for(np.concatenate(list(images.values())))
-        side = len(next(iter(images.values())))
-        row = np.full((side, side * len(names), 3), 128, np.uint8)
-        for column, name in enumerate(names):
-            if name in images:
-                row[:, column * side : (column + 1) * side] = to_picture(images[name], exposure)
-        rows.append(row)
-    width = max(row.shape[1] for row in rows)
-    sheet = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=128) for row in rows]
-    return Image.fromarray(np.concatenate(sheet))
+        draft.note("samples", spread(samples))
+        if errors:
+            draft.note("estimated_error", spread(errors))
+        if samples and config.target_error:
+            draft.note("share_over_target_at_max_spp", round(over / len(samples), 5))
+        if pairs:
+            draft.note("noise_floor", noise_floor(pairs))
+        else:
+            draft.note("noise_floor", f"no view was rendered twice: set render.noise_share above {config.noise_share:g}")
+        write_sheets(draft.files, scenes, draft.read)

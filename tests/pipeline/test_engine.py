@@ -140,6 +140,8 @@ def test_parts_are_plain_webdataset_tars(run):
         assert members["n004.square.txt"].mtime == 0
         data = tar.extractfile("n004.square.txt").read()
     assert data == squares.read("n004").members["square.txt"]
+    assert squares.read("n004", only=["square.txt"]).members == {"square.txt": data}
+    assert squares.read("n004", only=[]).members == {}
     assert not [name for name in members if squares.row(name.split(".")[0]).group != squares.row("n004").group]
 
 

@@ -28,8 +28,9 @@ class FakeArtifact:
     def ids(self, group=None):
         return [row.id for row in self.rows() if group in (None, row.group)]
 
-    def read(self, id):
-        return self._records[id][1]
+    def read(self, id, only=None):
+        record = self._records[id][1]
+        return record if only is None else Record(id, {name: record.members[name] for name in only})
 
     def file(self, name):
         return self.files / name

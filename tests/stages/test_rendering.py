@@ -6,20 +6,16 @@ import hashlib
 import os
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from pipeline.errors import Reject, UserError
-from pipeline.stage import Item
-from stages.arrays import unpack_json
-from stages.exr import decode_view, encode_view, read_rgb
+from pipeline.errors import UserError
+from stages.exr import encode_view, read_rgb
 from stages.metrics import log_error
 from stages.records import SceneRecord
 from stages.rendering import backend as backends
 from stages.rendering.render import render_views
-from stages.s04_render import Render, RenderConfig
 
 SCALAR = {"backend": "scalar"}
 
@@ -407,56 +403,7 @@ def test_means_match_cycles(shared_data, jit, name, spp, tolerance):
     assert np.allclose(ratio, 1, atol=tolerance), ratio
 
 
-# --- the stage, the backend, the command ------------------------------------------------------------------------------
-
-
-class Scenes:
-    """Stands for the scene artifact."""
-
-    def __init__(self, scenes):
-        self.scenes = scenes
-
-    def rows(self):
-        return [SimpleNamespace(id=id, item=id, group="train") for id in self.scenes]
-
-    def read(self, id):
-        return self.scenes[id].to_record()
-
-
-def test_stage_renders_drops_and_rejects(tmp_path):
-    good = clutter(lights=2, cameras=3)
-    good.camera_to_world = good.camera_to_world.copy()
-    good.camera_to_world[1] = camera((0, -2, 0), (0, -4, 0))  # looks away
-    good.camera_to_world[2] = camera((0, 0.495, 0.2), (0, 0.6, 0.2))  # at the wall
-    dark = clutter(lights=2)
-    dark.emission = dark.emission * 1e-6
-    inputs = {"scene": Scenes({"good": good, "dark": dark})}
-    stage, config = Render(), RenderConfig(resolution=16, max_spp=4)
-    items = list(stage.items(config, inputs))
-    assert items[0] == Item("good", "train", (("scene", "good"),))
-    worker = stage.open(config, inputs, SCALAR)
-    (record,) = stage.process(worker, items[0])
-    assert sorted(record.members) == ["meta.json", "view0.exr"]
-    views = unpack_json(record.members["meta.json"])["views"]
-    assert [view["status"] for view in views] == ["ok", "dark", "too_close"]
-    assert decode_view(record.members["view0.exr"]).lights.shape == (2, 16, 16, 3)
-    with pytest.raises(Reject) as caught:
-        list(stage.process(worker, items[1]))
-    assert caught.value.reason == "dark"
-
-    notes = {}
-    rows = inputs["scene"].rows()[:1]
-    draft = SimpleNamespace(rows=lambda: rows, read=lambda id: record, files=tmp_path, note=notes.__setitem__)
-    stage.finish(config, inputs, draft)
-    assert notes["views"] == {"ok": 1, "dark": 1, "too_close": 1, "clamped_values": 0}
-    assert (tmp_path / "contact-train.png").stat().st_size > 0
-
-
-def test_an_interrupted_artifact_keeps_its_backend():
-    stage = Render()
-    assert stage.environment(RenderConfig(), SCALAR) == SCALAR
-    with pytest.raises(UserError, match="begun with the backend llvm with /none"):
-        stage.environment(RenderConfig(), {"backend": "llvm", "library": "/none/libLLVM.so"})
+# --- the backend, the command ------------------------------------------------------------------------------
 
 
 def test_without_a_jit_backend_the_scalar_one_is_taken_with_a_word(monkeypatch, caplog):
