@@ -21,7 +21,7 @@ import numpy as np
 
 from stages.records import SceneRecord
 from stages.rendering.sums import Sums
-from stages.rendering.surfaces import face_normals, surface_mesh
+from stages.rendering.surfaces import FirstHitAlbedo, face_normals, surface_mesh
 
 SLOTS = 8  # lights per pass; more lights take several passes of the same kernel
 OTHER = SLOTS  # slot of a light that belongs to another pass: hidden like any light, black here
@@ -134,7 +134,8 @@ def trace_paths(scene, lights, albedo, ray, rng, limits, hide):
     active = mi.Bool(True)
 
     while active:
-        si = scene.ray_intersect(ray, active)
+        # without dPdUV: a frame that textures do not turn, so that the same samples go the same ways
+        si = scene.ray_intersect(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, False, active)
         active &= si.is_valid()
         slot = dr.select(active, dr.gather(mi.Int32, lights.slot, si.prim_index, active), -1)
         on_light = slot >= 0
@@ -144,7 +145,7 @@ def trace_paths(scene, lights, albedo, ray, rng, limits, hide):
         first = active & (bounce == 0) & ~through
         facing = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -1, 1)
         first_normal = dr.select(first, si.sh_frame.n * facing, first_normal)
-        first_albedo = dr.select(first, dr.gather(mi.Color3f, albedo, si.prim_index, first), first_albedo)
+        first_albedo = dr.select(first, albedo.eval(si, first), first_albedo)
         first_distance = dr.select(first, dr.norm(si.p - origin), first_distance)
         coverage = dr.select(first, 1, coverage)
 
@@ -226,8 +227,7 @@ class JitRenderer:
         self.record = scene
         mesh = surface_mesh(scene, np.arange(len(scene.triangles)))
         self.scene = mi.load_dict({"type": "scene", "surface": mesh})
-        emits = (scene.light_index >= 0)[:, None]
-        self.albedo = _floats(np.where(emits, 0, scene.diffuse + scene.specular))
+        self.albedo = FirstHitAlbedo(scene)
         self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
 
     def sample(

@@ -3,19 +3,31 @@ data.
 
 The material diffuse / pi + specular * GGX is ``twosided(blendbsdf(diffuse, roughconductor))`` with the two
 reflectances divided by their blend weights. Emitting triangles are black. Vertices are unshared, so that face
-attributes and corner normals hold.
+attributes, corner normals and texture coordinates hold.
+
+Design choice: a parameter that no triangle's patch varies is a face attribute, the same kernels as in a scene without
+textures; one that varies is an *atlas*, one picture with a tile per triangle. A textured triangle's tile is its patch with
+its border texels repeated, so that Mitsuba's bilinear look-up is the patch's own, clamped to the triangle; the tile of
+a constant one is four equal texels. The blend weight stays one per triangle, or the product of weight and colour would
+not be linear between texels; what is interpolated of roughness is its square, the GGX width.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from stages.records import SceneRecord
+from stages.records import PATCH_CHANNELS, PATCH_INSIDE, PATCH_KEPT, PATCH_SIDE, SceneRecord
 
 MIN_ALPHA = 1e-4  # GGX width below which the lobe is numerically a mirror
 MAX_WEIGHT = 0.999  # largest blend weight of the specular lobe; also its sampling probability
+TILE = PATCH_SIDE + 2  # texels of a textured triangle's tile per side
+SMALL_TILE = 2  # of a constant triangle's
 
 
 def face_normals(triangles: np.ndarray) -> np.ndarray:
@@ -24,64 +36,191 @@ def face_normals(triangles: np.ndarray) -> np.ndarray:
     return np.cross(edges[:, 0], edges[:, 1])
 
 
-def material(albedo_only: bool = False) -> mi.BSDF:
-    """The two-sided GGX material that reads face attributes; ``albedo_only``: a diffuse one for first-hit channels."""
+@dataclass
+class Parameter:
+    """A material parameter of the faces: ``values`` (F,) or (F, 3), and (T, 32, 32) or (T, 32, 32, 3) ``patches`` where it
+    changes within a triangle."""
 
-    def attribute(name: str) -> dict:
-        return {"type": "mesh_attribute", "name": f"face_{name}"}
+    values: np.ndarray
+    patches: np.ndarray | None = None
 
-    diffuse = {"type": "diffuse", "reflectance": attribute("diffuse")}
+
+class Surfaces:
+    """What the renderer knows of the triangles ``faces`` (indices) of a scene: their parameters and where their patches lie.
+
+    Triangle i of everything here is faces[i]. Emitting triangles are black and constant.
+    """
+
+    def __init__(self, scene: SceneRecord, faces: np.ndarray):
+        emits = scene.light_index[faces] >= 0
+        black = np.where(emits, np.float32(0), np.float32(1))[:, None]
+        diffuse, specular = scene.diffuse[faces] * black, scene.specular[faces] * black
+        weight = np.clip(specular.max(axis=1), 0, MAX_WEIGHT)
+        below, above = (1 - weight)[:, None], np.where(weight > 0, weight, 1)[:, None]
+        self.weight = weight
+        self.albedo = Parameter(diffuse + specular)
+        self.diffuse = Parameter(diffuse / below)
+        self.specular = Parameter(specular / above)
+        self.alpha = Parameter(np.maximum(scene.roughness[faces] ** 2, MIN_ALPHA))
+        index = scene.patch_index[faces] if scene.textured else np.full(len(faces), -1)
+        self.textured = np.flatnonzero((index >= 0) & ~emits)  # those of the faces that have a tile of their own
+        if len(self.textured):
+            patches = scene.patches[index[self.textured]]
+            parts = {name: patches[:, PATCH_CHANNELS[name]] for name in ("diffuse", "specular", "roughness")}
+            varies = {name: bool((part[..., PATCH_KEPT] != part[:, :, :1, 0]).any()) for name, part in parts.items()}
+            # (T, 32, 32, channels), row by row as the patches have them
+            d, s, r = (np.moveaxis(part.astype(np.float32), 1, -1) for part in parts.values())
+            below, above = (values[self.textured, None, None] for values in (below, above))
+            if varies["diffuse"]:
+                self.diffuse.patches = d / below
+            if varies["specular"]:
+                self.specular.patches = s / above
+            if varies["roughness"]:
+                self.alpha.patches = np.maximum(r[..., 0] ** 2, MIN_ALPHA)
+            if varies["diffuse"] or varies["specular"]:
+                self.albedo.patches = d + s
+
+    @cached_property
+    def atlas(self) -> Atlas:
+        return Atlas(len(self.weight), self.textured)
+
+
+class Atlas:
+    """Where the tiles of ``count`` triangles lie in a square picture; those of ``textured`` (indices) hold patches."""
+
+    def __init__(self, count: int, textured: np.ndarray):
+        constant = np.setdiff1d(np.arange(count), textured)
+        columns = max(1, int(np.ceil(np.sqrt(len(textured) + len(constant) * (SMALL_TILE / TILE) ** 2))))
+        self.width = columns * TILE
+        self.corner = np.zeros((count, 2), np.int64)  # column and row of each tile's first texel
+        place = np.arange(len(textured))
+        self.corner[textured] = np.stack([place % columns, place // columns], axis=1) * TILE
+        top = -(-len(textured) // columns) * TILE
+        place, columns = np.arange(len(constant)), self.width // SMALL_TILE
+        self.corner[constant] = np.stack([place % columns, place // columns], axis=1) * SMALL_TILE + [0, top]
+        self.height = top + -(-len(constant) // columns) * SMALL_TILE
+        self.textured, self.constant = textured, constant
+
+    def coordinates(self) -> np.ndarray:
+        """(F, 3, 2) texture coordinates of the triangles' corners; (0, 0) is the picture's first texel's outer corner."""
+        legs = np.array([[0, 0], [PATCH_SIDE, 0], [0, PATCH_SIDE]])
+        texels = np.empty((len(self.corner), 3, 2))
+        texels[self.textured] = self.corner[self.textured, None] + 1 + legs
+        texels[self.constant] = self.corner[self.constant, None] + SMALL_TILE / 2
+        return texels / [self.width, self.height]
+
+    def picture(self, parameter: Parameter) -> np.ndarray:
+        """(height, width, channels) float32 of a parameter that varies."""
+        values, patches = parameter.values, parameter.patches
+        if values.ndim == 1:
+            values, patches = values[:, None], patches[..., None]
+        out = np.zeros((self.height, self.width, values.shape[1]), np.float32)
+
+        def fill(faces: np.ndarray, side: int, tiles: np.ndarray) -> None:
+            step = np.arange(side)
+            rows = self.corner[faces, 1][:, None, None] + step[:, None]
+            columns = self.corner[faces, 0][:, None, None] + step
+            out[rows, columns] = tiles
+
+        fill(self.textured, TILE, np.pad(patches, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge"))
+        fill(self.constant, SMALL_TILE, values[self.constant, None, None])
+        return out
+
+
+def material(surfaces: Surfaces, albedo_only: bool = False) -> mi.BSDF:
+    """The two-sided GGX material of the faces; ``albedo_only``: a diffuse one for first-hit channels."""
+
+    def source(name: str) -> Any:
+        parameter = getattr(surfaces, name)
+        if parameter.patches is None:
+            return {"type": "mesh_attribute", "name": f"face_{name}"}
+        return atlas_texture(surfaces.atlas.picture(parameter))
+
     if albedo_only:
-        return mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": attribute("albedo")}})
+        return mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": source("albedo")}})
+    diffuse = {"type": "diffuse", "reflectance": source("diffuse")}
     # `material: none` is a perfect mirror: no Fresnel term.
     specular = {
         "type": "roughconductor",
         "distribution": "ggx",
         "material": "none",
-        "alpha": attribute("alpha"),
-        "specular_reflectance": attribute("specular"),
+        "alpha": source("alpha"),
+        "specular_reflectance": source("specular"),
     }
-    blend = {"type": "blendbsdf", "weight": attribute("weight"), "bsdf_0": diffuse, "bsdf_1": specular}
+    weight = {"type": "mesh_attribute", "name": "face_weight"}
+    blend = {"type": "blendbsdf", "weight": weight, "bsdf_0": diffuse, "bsdf_1": specular}
     return mi.load_dict({"type": "twosided", "bsdf": blend})
 
 
-def surface_mesh(scene: SceneRecord, faces: np.ndarray, bsdf: mi.BSDF | None = None, albedo_only: bool = False) -> mi.Mesh:
+def atlas_texture(picture: np.ndarray) -> Any:
+    """A (H, W, channels) picture as a Mitsuba texture: its numbers as they are, bilinear, nothing from outside."""
+    # not accelerated: a GPU's own texture units interpolate with 8 bits
+    options = {"raw": True, "filter_type": "bilinear", "wrap_mode": "clamp", "accel": False}
+    return mi.load_dict({"type": "bitmap", "data": mi.TensorXf(picture), **options})
+
+
+class FirstHitAlbedo:
+    """diffuse + specular at a surface interaction of a mesh of all triangles, 0 on emitters (JIT variants only)."""
+
+    def __init__(self, scene: SceneRecord):
+        surfaces = Surfaces(scene, np.arange(len(scene.triangles)))
+        varies = surfaces.albedo.patches is not None
+        self.texture = atlas_texture(surfaces.atlas.picture(surfaces.albedo)) if varies else None
+        self.values = None if varies else _floats(surfaces.albedo.values)
+
+    def eval(self, si: Any, active: Any) -> Any:
+        if self.texture is None:
+            return dr.gather(mi.Color3f, self.values, si.prim_index, active)
+        return self.texture.eval(si, active)
+
+
+def surface_mesh(scene: SceneRecord, faces: np.ndarray, albedo_only: bool = False) -> mi.Mesh:
     """The triangles ``faces`` (indices) as one mesh; triangle i of the mesh is faces[i]."""
-    emits = scene.light_index[faces] >= 0
-    black = np.where(emits, np.float32(0), np.float32(1))[:, None]
-    diffuse, specular = scene.diffuse[faces] * black, scene.specular[faces] * black
-    mesh = mesh_of(scene.triangles[faces], scene.vertex_normals[faces], bsdf or material(albedo_only))
-    if albedo_only:
-        attributes = {"albedo": diffuse + specular}
-    else:
-        weight = np.clip(specular.max(axis=1), 0, MAX_WEIGHT)
-        attributes = {
-            "diffuse": diffuse / (1 - weight)[:, None],
-            "specular": specular / np.where(weight > 0, weight, 1)[:, None],
-            "weight": weight,
-            "alpha": np.maximum(scene.roughness[faces] ** 2, MIN_ALPHA),
-        }
+    surfaces = Surfaces(scene, faces)
+    names = ("albedo",) if albedo_only else ("diffuse", "specular", "alpha")
+    parameters = {name: getattr(surfaces, name) for name in names}
+    textured = any(parameter.patches is not None for parameter in parameters.values())
+    coordinates = surfaces.atlas.coordinates() if textured else None
+    bsdf = material(surfaces, albedo_only)
+    mesh = mesh_of(scene.triangles[faces], scene.vertex_normals[faces], bsdf, coordinates=coordinates)
+    attributes = {name: parameter.values for name, parameter in parameters.items() if parameter.patches is None}
+    if not albedo_only:
+        attributes["weight"] = surfaces.weight
     for name, values in attributes.items():
         mesh.add_attribute(f"face_{name}", values.shape[1] if values.ndim > 1 else 1, _floats(values))
     return mesh
 
 
 def mesh_of(
-    triangles: np.ndarray, normals: np.ndarray | None, bsdf: mi.BSDF | None = None, emitter: mi.Emitter | None = None
+    triangles: np.ndarray,
+    normals: np.ndarray | None,
+    bsdf: mi.BSDF | None = None,
+    emitter: mi.Emitter | None = None,
+    coordinates: np.ndarray | None = None,
 ) -> mi.Mesh:
-    """(F, 3, 3) triangles with corner normals (None: flat) as a Mitsuba mesh with unshared vertices."""
+    """(F, 3, 3) triangles with corner normals (None: flat) and (F, 3, 2) texture coordinates (None: none) as a Mitsuba mesh
+    with unshared vertices."""
     props = mi.Properties()
     if bsdf is not None:
         props["bsdf"] = bsdf
     if emitter is not None:
         props["emitter"] = emitter
     count = len(triangles)
-    mesh = mi.Mesh("triangles", 3 * count, count, props=props, has_vertex_normals=normals is not None)
+    mesh = mi.Mesh(
+        "triangles",
+        3 * count,
+        count,
+        props=props,
+        has_vertex_normals=normals is not None,
+        has_vertex_texcoords=coordinates is not None,
+    )
     params = mi.traverse(mesh)
     params["vertex_positions"] = _floats(triangles)
     params["faces"] = np.arange(3 * count, dtype=np.uint32) if _scalar() else mi.UInt32(np.arange(3 * count, dtype=np.uint32))
     if normals is not None:
         params["vertex_normals"] = _floats(normals)
+    if coordinates is not None:
+        params["vertex_texcoords"] = _floats(coordinates)
     params.update()
     return mesh
 

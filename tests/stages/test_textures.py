@@ -1,0 +1,253 @@
+"""Textured triangles: baked where the image says, rendered where they were baked, read back from released files."""
+
+from __future__ import annotations
+
+import io
+import json
+import zlib
+
+import numpy as np
+import pytest
+from fakes import FakeArtifact, decimated
+from test_rendering import SCALAR, backend, build, camera, clutter, hashed, jit, quad  # noqa: F401 (fixtures)
+
+from pipeline.config import parse
+from pipeline.errors import UserError
+from pipeline.stage import Item, Record
+from stages.arrays import unpack_arrays
+from stages.records import PATCH_INSIDE, PATCH_KEPT, MeshRecord, SceneRecord, TextureRecord, patch_means
+from stages.rendering.render import render_views
+from stages.scenes import textures
+from stages.tonemap import from_picture, to_picture
+
+ROW, COLUMN = np.indices((32, 32))
+FIRST, SECOND = (COLUMN + 0.5) / 32, (ROW + 0.5) / 32  # weights of corners 1 and 2 at the texels' centres
+
+
+def patches_of(triangles, colour, specular=0.0, roughness=1.0):
+    """(F, 7, 32, 32) float16: ``colour(points (..., 3))`` as diffuse, the rest constant or a function of the points."""
+    a, b, c = np.moveaxis(np.asarray(triangles, np.float64), 1, 0)[:, :, None, None]
+    points = a + FIRST[..., None] * (b - a) + SECOND[..., None] * (c - a)
+    value = [v(points) if callable(v) else np.broadcast_to(v, points.shape[:-1]) for v in (specular, roughness)]
+    channels = [*np.moveaxis(np.broadcast_to(colour(points), points.shape), -1, 0), value[0], value[0], value[0], value[1]]
+    return (np.stack(channels, axis=1) * PATCH_KEPT).astype(np.float16)
+
+
+def textured(scene: SceneRecord, faces, patches) -> SceneRecord:
+    """The scene with these faces textured."""
+    scene.patch_index = np.full(len(scene.triangles), -1, np.int32)
+    scene.patch_index[faces] = np.arange(len(patches))
+    scene.patches = patches
+    for name, values in patch_means(patches).items():
+        column = getattr(scene, name).copy()
+        column[faces] = values
+        setattr(scene, name, column)
+    return scene
+
+
+# --- baking -----------------------------------------------------------------------------------------------------------
+
+
+def ramp(width=256, height=128):
+    """An image that is linear in light: red rises to the right, green downwards."""
+    x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
+    return to_picture(np.stack([x, y, np.full_like(x, 0.25)], axis=-1))
+
+
+def test_a_linear_image_is_baked_where_it_lies():
+    """Texel [row, column] shows the image at its weights of corners 1 (column) and 2 (row), v downwards."""
+    uv = np.array([[[0.1, 0.2], [0.9, 0.3], [0.2, 0.8]], [[0.8, 0.8], [0.2, 0.7], [0.7, 0.1]]])
+    baked = textures.bake(ramp(), uv)
+    place = uv[:, None, None, 0] + FIRST[..., None] * (uv[:, 1] - uv[:, 0])[:, None, None]
+    place = place + SECOND[..., None] * (uv[:, 2] - uv[:, 0])[:, None, None]
+    assert np.abs(baked[..., :2] - place)[:, PATCH_KEPT].max() < 0.01  # 8 bits of sRGB are up to 0.009 apart in light
+    assert np.abs(baked[..., 2] - 0.25)[:, PATCH_KEPT].max() < 0.01
+    assert (baked[:, ~PATCH_KEPT] == 0).all()
+
+
+def test_texels_are_means_in_linear_light():
+    """A pattern finer than a texel becomes its mean light, not a moire nor the mean of its bytes."""
+    image = np.zeros((512, 512, 3), np.uint8)
+    image[::2, 1::2] = image[1::2, ::2] = 255
+    baked = textures.bake(image, np.array([[[0, 0], [1, 0], [0, 1]]]))
+    assert np.abs(baked[0, PATCH_INSIDE] - 0.5).max() < 0.06
+    assert abs(baked[0, PATCH_INSIDE].mean() - 0.5) < 0.005
+
+
+def test_coordinates_outside_the_image_wrap_clamp_or_mirror():
+    image = ramp(64, 64)
+    at = {name: textures.look_up(image, np.array([[1.25, 0.5]]), (i, i))[0, 0] for i, name in enumerate(TextureRecord.WRAPS)}
+    assert at["repeat"] == pytest.approx(0.25, abs=0.01)
+    assert at["clamp"] == pytest.approx(63.5 / 64, abs=0.01)
+    assert at["mirror"] == pytest.approx(0.75, abs=0.01)
+    seam = textures.look_up(image, np.array([[0.0, 0.5], [1.0, 0.5]]), (0, 0))[:, 0]
+    assert seam == pytest.approx([0.5, 0.5], abs=0.02)  # between the last and the first column
+
+
+def test_what_lies_beside_a_triangle_in_the_atlas_does_not_bleed_in():
+    """Red above the diagonal, green below: a triangle on one side gets none of the other, at whatever scale."""
+    y, x = np.indices((256, 256))
+    image = np.where((x + y < 256 - 2)[..., None], [255, 0, 0], [0, 255, 0]).astype(np.uint8)
+    baked = textures.bake(image, np.array([[[0, 0], [0.985, 0], [0, 0.985]]]))
+    assert baked[0, PATCH_KEPT][:, 1].max() < 0.01 and baked[0, PATCH_KEPT][:, 0].min() > 0.99
+
+
+def test_a_remeshed_surface_gets_the_colours_of_the_nearest_points():
+    """The coarse square below takes what the fine one above it shows, whatever its triangles."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    uv = np.array([[[0, 1], [1, 1], [1, 0]], [[0, 1], [1, 0], [0, 0]]])  # image upright: v runs down, y up
+    one = np.zeros(1, np.int16)
+    texture = TextureRecord("a", uv, np.zeros(2, np.int16), np.float32([[0.5, 1, 1]]), one, np.zeros((1, 2), np.uint8), [ramp()])
+    rng = np.random.default_rng(0)
+    triangles = rng.uniform(0.1, 0.9, (5, 3, 3)) * [1, 1, 0] - [0, 0, 0.01]
+    got = textures.transfer(texture, corners, faces, triangles)
+    a, b, c = np.moveaxis(triangles, 1, 0)[:, :, None, None]
+    points = a + FIRST[..., None] * (b - a) + SECOND[..., None] * (c - a)
+    expected = np.stack([0.5 * points[..., 0], 1 - points[..., 1]], axis=-1)
+    assert np.abs(got[..., :2] - expected)[:, PATCH_INSIDE].max() < 0.01
+
+
+def test_hidden_faces_lend_no_colours():
+    """A green box inside a red one: rays from outside meet only the red one, though the green one may be nearer."""
+    from stages.geometry.procedural import box, join
+
+    vertices, faces = join(box((1, 1, 1)), box((0.98, 0.98, 0.98)))
+    half = len(faces) // 2
+    material = np.repeat(np.int16([0, 1]), half)
+    plain = np.full(2, -1, np.int16)
+    colour, wrap = np.float32([[1, 0, 0], [0, 1, 0]]), np.zeros((2, 2), np.uint8)
+    texture = TextureRecord("a", np.zeros((len(faces), 3, 2)), material, colour, plain, wrap, [])
+    seen = textures.seen_faces(vertices, faces)
+    assert seen[:half].all() and not seen[half:].any()
+    below = vertices[faces[:half]] * 0.983  # nearer to the inner box
+    assert textures.transfer(texture, vertices, faces, below)[:, PATCH_INSIDE, 1].min() > 0.99
+    assert textures.transfer(texture, vertices, faces, below, seen)[:, PATCH_INSIDE, 0].min() > 0.99
+
+
+# --- records ----------------------------------------------------------------------------------------------------------
+
+
+def test_scenes_carry_patches_only_where_there_are_textures():
+    plain = clutter()
+    before = plain.to_record()
+    scene = textured(clutter(), [0, 3], patches_of(clutter().triangles[[0, 3]], lambda p: np.full(3, 0.5)))
+    members = scene.to_record().members
+    back = SceneRecord.from_record(Record("test", members))
+    assert back.textured and back.patch_index.tolist()[:4] == [0, -1, -1, 1] and back.patch_index.dtype == np.int32
+    assert np.array_equal(back.patches, scene.patches) and back.patches.dtype == np.float16
+    scene.patch_index[:] = -1
+    plain.patch_index = scene.patch_index
+    assert plain.to_record().members == before.members  # nothing textured: nothing stored
+    again = SceneRecord.from_record(before)
+    assert not again.textured and again.patch_index is None and "patches" not in unpack_arrays(before.members["scene.npz"])
+
+
+# --- path tracing -----------------------------------------------------------------------------------------------------
+
+
+def picture(points):
+    """Colours that tell left from right, up from down, and change fast enough to show a misplaced texel."""
+    x, z = points[..., 0], points[..., 2]
+    return np.stack([0.5 + 0.9 * x, 0.5 + 0.9 * z, 0.5 + 0.4 * np.sin(10 * (x + 0.5 * z))], axis=-1)
+
+
+def furnace(patches=None, diffuse=0.5, specular=0.0, roughness=1.0):
+    """A unit square in the xz plane that fills the camera's picture, inside a closed light of radiance 1."""
+    axes = np.eye(3)
+    faces = [quad(s * axes[i] * 3, axes[(i + 1) % 3] * 3, axes[(i + 2) % 3] * 3) for i in range(3) for s in (-1.0, 1.0)]
+    square = quad((0, 0, 0), (0.5, 0, 0), (0, 0, 0.5))
+    fov = 2 * np.degrees(np.arctan(0.25))
+    scene = build([(square, diffuse, specular, roughness)], [(np.concatenate(faces), 1)], [camera((0, -2, 0))], fov=fov)
+    return textured(scene, [0, 1], patches(square)) if patches else scene
+
+
+def pixel_points(size):
+    x, z = np.meshgrid((np.arange(size) + 0.5) / size - 0.5, 0.5 - (np.arange(size) + 0.5) / size)
+    return np.stack([x, 0 * x, z], axis=-1)
+
+
+def test_a_textured_square_shows_its_patches_where_they_lie(backend):  # noqa: F811
+    """Under light from everywhere radiance is the diffuse colour itself: two triangles, one picture, no seam."""
+    scene = furnace(lambda square: patches_of(square, picture))
+    view = render_views(scene, 32, max_spp=64, seed=0, backend=backend, denoise=False)[0]
+    expected = picture(pixel_points(32))
+    inside = np.abs(pixel_points(32)[..., [0, 2]]).max(axis=-1) < 0.45
+    # clamped look-up is up to half a texel off along a triangle's first two sides, here on the diagonal
+    assert np.abs(view.albedo - expected)[inside].max() < 0.04 and np.abs(view.albedo - expected)[inside].mean() < 0.005
+    blocks = [image.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3)) for image in (view.image, expected)]  # against the noise
+    assert np.abs(blocks[0] - blocks[1]).max() < 0.04
+
+
+def test_specular_and_roughness_patches_act(backend):  # noqa: F811
+    """Left diffuse, right specular: the same light from everywhere, but below a small lamp only the right side mirrors it."""
+    share = {"specular": lambda p: 0.9 * (p[..., 0] > 0), "roughness": lambda p: np.where(p[..., 2] > 0, 0.7, 0.1)}
+    scene = furnace(lambda square: patches_of(square, lambda p: 0.8 * (p[..., :1] <= 0) * np.ones(3), **share))
+    view = render_views(scene, 16, max_spp=256, seed=0, backend=backend, denoise=False)[0]
+    left, right = slice(2, 7), slice(9, 14)
+    assert np.allclose(view.albedo[2:14, left], 0.8, atol=0.01) and np.allclose(view.albedo[2:14, right], 0.9, atol=0.01)
+    assert np.allclose(view.image[2:14, left].mean(), 0.8, atol=0.02)
+    # a rough surface loses light in its single scattering, a smooth one does not
+    assert np.allclose(view.image[9:14, right].mean(), 0.9, atol=0.02)
+
+    square = quad((0, 0, 0), (0.5, 0, 0), (0, 0, 0.5))
+    lamp = np.array([[[-0.02, -2, 0], [0.02, -2, 0], [0, -2, 0.03]]])
+    above = build([(square, 0.5, 0, 1)], [(lamp, 5000)], [camera((0, -1.9, 0))], fov=29.0)
+    above = textured(above, [0, 1], patches_of(square, lambda p: 0.8 * (p[..., :1] <= 0) * np.ones(3), **share))
+    image = render_views(above, 16, max_spp=256, seed=0, backend=backend, denoise=False)[0].image.mean(axis=-1)
+    assert image[8:10, 8:10].mean() > 5 * image[6:8, 8:10].mean() > 5 * image[6:8, 6:8].mean() * 0.2
+    assert image[2:6, 10:14].mean() > 3 * image[10:14, 10:14].mean()  # far from the mirror direction only the rough one shines
+
+
+def constant_patches(scene, faces):
+    values = np.concatenate([scene.diffuse[faces], scene.specular[faces], scene.roughness[faces, None]], axis=1)
+    return (values[..., None, None] * PATCH_KEPT).astype(np.float16)
+
+
+def rounded(scene):
+    """The scene with the parameters that half-floats can hold."""
+    for name in ("diffuse", "specular", "roughness"):
+        setattr(scene, name, getattr(scene, name).astype(np.float16).astype(np.float32))
+    return scene
+
+
+def test_constant_patches_change_nothing(backend):  # noqa: F811
+    scene = rounded(clutter())
+    faces = [0, 1, 4, 5]
+    same = textured(rounded(clutter()), faces, constant_patches(scene, faces))
+    runs = [hashed(render_views(s, 16, max_spp=8, seed=2, backend=backend, denoise=False)) for s in (scene, same)]
+    assert runs[0] == runs[1]
+
+
+def test_the_atlas_renders_like_face_attributes(jit):  # noqa: F811
+    """One far triangle that varies puts all others into the atlas: they must look as before."""
+    scene, size = rounded(clutter()), 16
+    speck = np.array([[[50.0, 50, 50], [50.01, 50, 50], [50, 50.01, 50]]])
+
+    def with_speck(patches):
+        base = rounded(clutter())
+        parts = {name: getattr(base, name) for name in SceneRecord.DTYPES if name not in ("camera_to_world", "fov_deg")}
+        for name, values in parts.items():
+            more = speck if name == "triangles" else values[:1]
+            setattr(base, name, np.concatenate([values, more]).astype(values.dtype))
+        faces = [0, 1, 4, 5, len(base.triangles) - 1]
+        mixed = np.concatenate([constant_patches(scene, faces[:4]), patches])
+        return textured(base, faces, mixed)
+
+    varied = patches_of(speck, lambda p: np.broadcast_to(FIRST[..., None], (*p.shape[:-1], 3)), FIRST * 0.5, 0.5 + FIRST / 2)
+    a = render_views(scene, size, max_spp=32, seed=2, backend=jit, denoise=False)
+    b = render_views(with_speck(varied), size, max_spp=32, seed=2, backend=jit, denoise=False)
+    for one, two in zip(a, b, strict=True):
+        close = np.isclose(one.image, two.image, rtol=1e-3, atol=1e-4).all(axis=-1)
+        assert close.mean() > 0.97  # a rounding may end a path or turn it
+        assert np.allclose(one.albedo, two.albedo, atol=1e-3)
+        assert np.allclose(one.image.mean(), two.image.mean(), rtol=0.02)
+
+
+def test_textured_emitters_are_black(jit):  # noqa: F811
+    scene = clutter(lights=1, cameras=1)
+    light = int(np.flatnonzero(scene.light_index >= 0)[0])
+    lit = textured(clutter(lights=1, cameras=1), [light], patches_of(scene.triangles[[light]], picture))
+    lit.diffuse, lit.specular, lit.roughness = scene.diffuse, scene.specular, scene.roughness
+    runs = [hashed(render_views(s, 16, max_spp=8, seed=2, backend=jit, denoise=False)) for s in (scene, lit)]
+    assert runs[0] == runs[1]
