@@ -295,8 +295,8 @@ def _patches(texture: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray | 
         triangles = np.flatnonzero(varies[:, PATCH_CHANNELS[name]].any(axis=1))
         if len(triangles):
             raise UserError(
-                f"{path}: {name} changes within triangle {triangles[0]} (and {len(triangles) - 1} more): only diffuse, specular "
-                "and roughness may; make it constant or split the triangle"
+                f"{path}: {name} changes within triangle {triangles[0]} (and {len(triangles) - 1} more): only diffuse, "
+                "specular and roughness may; make it constant or split the triangle"
             )
     rows = np.flatnonzero(varies.any(axis=1))
     if len(rows) == 0:

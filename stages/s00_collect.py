@@ -234,6 +234,8 @@ class _Collector:
             "faces": len(mesh.faces),
             "signature": measure.signature(vertices, mesh.faces),
         }
+        if mesh.texture is not None:
+            mesh.texture.id = name + TextureRecord.SUFFIX
         return MeshRecord(name, vertices, mesh.faces.astype(np.int32), meta), mesh.texture, mesh.notes[:20]
 
 

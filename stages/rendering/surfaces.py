@@ -14,7 +14,6 @@ not be linear between texels; what is interpolated of roughness is its square, t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -22,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from stages.records import PATCH_CHANNELS, PATCH_INSIDE, PATCH_KEPT, PATCH_SIDE, SceneRecord
+from stages.records import PATCH_CHANNELS, PATCH_KEPT, PATCH_SIDE, SceneRecord
 
 MIN_ALPHA = 1e-4  # GGX width below which the lobe is numerically a mirror
 MAX_WEIGHT = 0.999  # largest blend weight of the specular lobe; also its sampling probability
@@ -36,53 +35,57 @@ def face_normals(triangles: np.ndarray) -> np.ndarray:
     return np.cross(edges[:, 0], edges[:, 1])
 
 
-@dataclass
-class Parameter:
-    """A material parameter of the faces: ``values`` (F,) or (F, 3), and (T, 32, 32) or (T, 32, 32, 3) ``patches`` where it
-    changes within a triangle."""
-
-    values: np.ndarray
-    patches: np.ndarray | None = None
-
-
 class Surfaces:
     """What the renderer knows of the triangles ``faces`` (indices) of a scene: their parameters and where their patches lie.
 
-    Triangle i of everything here is faces[i]. Emitting triangles are black and constant.
+    Triangle i of everything here is faces[i]. Emitting triangles are black and constant. Parameters are ``diffuse`` and
+    ``specular`` (each over its blend weight), ``alpha``, and ``albedo``, the sum of the two undivided.
     """
 
     def __init__(self, scene: SceneRecord, faces: np.ndarray):
         emits = scene.light_index[faces] >= 0
         black = np.where(emits, np.float32(0), np.float32(1))[:, None]
         diffuse, specular = scene.diffuse[faces] * black, scene.specular[faces] * black
-        weight = np.clip(specular.max(axis=1), 0, MAX_WEIGHT)
-        below, above = (1 - weight)[:, None], np.where(weight > 0, weight, 1)[:, None]
-        self.weight = weight
-        self.albedo = Parameter(diffuse + specular)
-        self.diffuse = Parameter(diffuse / below)
-        self.specular = Parameter(specular / above)
-        self.alpha = Parameter(np.maximum(scene.roughness[faces] ** 2, MIN_ALPHA))
+        self.weight = np.clip(specular.max(axis=1), 0, MAX_WEIGHT)
+        self._below, self._above = (1 - self.weight)[:, None], np.where(self.weight > 0, self.weight, 1)[:, None]
+        self.values = {
+            "diffuse": diffuse / self._below,
+            "specular": specular / self._above,
+            "alpha": np.maximum(scene.roughness[faces] ** 2, MIN_ALPHA),
+            "albedo": diffuse + specular,
+        }
+        self.varying: set[str] = set()  # parameters that change within some triangle
         index = scene.patch_index[faces] if scene.textured else np.full(len(faces), -1)
         self.textured = np.flatnonzero((index >= 0) & ~emits)  # those of the faces that have a tile of their own
         if len(self.textured):
-            patches = scene.patches[index[self.textured]]
-            parts = {name: patches[:, PATCH_CHANNELS[name]] for name in ("diffuse", "specular", "roughness")}
-            varies = {name: bool((part[..., PATCH_KEPT] != part[:, :, :1, 0]).any()) for name, part in parts.items()}
-            # (T, 32, 32, channels), row by row as the patches have them
-            d, s, r = (np.moveaxis(part.astype(np.float32), 1, -1) for part in parts.values())
-            below, above = (values[self.textured, None, None] for values in (below, above))
-            if varies["diffuse"]:
-                self.diffuse.patches = d / below
-            if varies["specular"]:
-                self.specular.patches = s / above
-            if varies["roughness"]:
-                self.alpha.patches = np.maximum(r[..., 0] ** 2, MIN_ALPHA)
-            if varies["diffuse"] or varies["specular"]:
-                self.albedo.patches = d + s
+            self._patches = np.ascontiguousarray(scene.patches[index[self.textured]], np.float16)
+            bits = self._patches.view(np.uint16)  # compares faster than half-floats do
+            change = ((bits != bits[:, :, :1, :1]) & PATCH_KEPT).any(axis=(0, 2, 3))
+            change = {name: bool(change[PATCH_CHANNELS[name]].any()) for name in ("diffuse", "specular", "roughness")}
+            of = {"diffuse": "diffuse", "specular": "specular", "alpha": "roughness"}
+            self.varying = {name for name, source in of.items() if change[source]}
+            if change["diffuse"] or change["specular"]:
+                self.varying.add("albedo")
 
     @cached_property
     def atlas(self) -> Atlas:
         return Atlas(len(self.weight), self.textured)
+
+    def picture(self, name: str) -> np.ndarray:
+        """(height, width, channels) float32: the atlas of a parameter that varies."""
+
+        def part(channels: str) -> np.ndarray:  # (T, 32, 32, channels)
+            return np.moveaxis(self._patches[:, PATCH_CHANNELS[channels]].astype(np.float32), 1, -1)
+
+        if name == "diffuse":
+            patches = part("diffuse") / self._below[self.textured, None, None]
+        elif name == "specular":
+            patches = part("specular") / self._above[self.textured, None, None]
+        elif name == "alpha":
+            patches = np.maximum(part("roughness") ** 2, MIN_ALPHA)
+        else:
+            patches = part("diffuse") + part("specular")
+        return self.atlas.picture(self.values[name].reshape(len(self.weight), -1), patches)
 
 
 class Atlas:
@@ -109,11 +112,8 @@ class Atlas:
         texels[self.constant] = self.corner[self.constant, None] + SMALL_TILE / 2
         return texels / [self.width, self.height]
 
-    def picture(self, parameter: Parameter) -> np.ndarray:
-        """(height, width, channels) float32 of a parameter that varies."""
-        values, patches = parameter.values, parameter.patches
-        if values.ndim == 1:
-            values, patches = values[:, None], patches[..., None]
+    def picture(self, values: np.ndarray, patches: np.ndarray) -> np.ndarray:
+        """(height, width, channels) float32 from (F, channels) values and the (T, 32, 32, channels) of textured triangles."""
         out = np.zeros((self.height, self.width, values.shape[1]), np.float32)
 
         def fill(faces: np.ndarray, side: int, tiles: np.ndarray) -> None:
@@ -131,10 +131,9 @@ def material(surfaces: Surfaces, albedo_only: bool = False) -> mi.BSDF:
     """The two-sided GGX material of the faces; ``albedo_only``: a diffuse one for first-hit channels."""
 
     def source(name: str) -> Any:
-        parameter = getattr(surfaces, name)
-        if parameter.patches is None:
+        if name not in surfaces.varying:
             return {"type": "mesh_attribute", "name": f"face_{name}"}
-        return atlas_texture(surfaces.atlas.picture(parameter))
+        return atlas_texture(surfaces.picture(name))
 
     if albedo_only:
         return mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": source("albedo")}})
@@ -164,9 +163,9 @@ class FirstHitAlbedo:
 
     def __init__(self, scene: SceneRecord):
         surfaces = Surfaces(scene, np.arange(len(scene.triangles)))
-        varies = surfaces.albedo.patches is not None
-        self.texture = atlas_texture(surfaces.atlas.picture(surfaces.albedo)) if varies else None
-        self.values = None if varies else _floats(surfaces.albedo.values)
+        varies = "albedo" in surfaces.varying
+        self.texture = atlas_texture(surfaces.picture("albedo")) if varies else None
+        self.values = None if varies else _floats(surfaces.values["albedo"])
 
     def eval(self, si: Any, active: Any) -> Any:
         if self.texture is None:
@@ -177,13 +176,11 @@ class FirstHitAlbedo:
 def surface_mesh(scene: SceneRecord, faces: np.ndarray, albedo_only: bool = False) -> mi.Mesh:
     """The triangles ``faces`` (indices) as one mesh; triangle i of the mesh is faces[i]."""
     surfaces = Surfaces(scene, faces)
-    names = ("albedo",) if albedo_only else ("diffuse", "specular", "alpha")
-    parameters = {name: getattr(surfaces, name) for name in names}
-    textured = any(parameter.patches is not None for parameter in parameters.values())
-    coordinates = surfaces.atlas.coordinates() if textured else None
+    coordinates = surfaces.atlas.coordinates() if surfaces.varying else None
     bsdf = material(surfaces, albedo_only)
     mesh = mesh_of(scene.triangles[faces], scene.vertex_normals[faces], bsdf, coordinates=coordinates)
-    attributes = {name: parameter.values for name, parameter in parameters.items() if parameter.patches is None}
+    names = ("albedo",) if albedo_only else ("diffuse", "specular", "alpha")
+    attributes = {name: surfaces.values[name] for name in names if name not in surfaces.varying}
     if not albedo_only:
         attributes["weight"] = surfaces.weight
     for name, values in attributes.items():

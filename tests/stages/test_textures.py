@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
+import struct
 import zlib
+from collections import Counter
 
 import numpy as np
 import pytest
-from fakes import FakeArtifact, decimated
+from fakes import FakeArtifact, blob, decimated
+from PIL import Image
+from test_collect import CORNERS, FACES, gltf, words
 from test_rendering import SCALAR, backend, build, camera, clutter, hashed, jit, quad  # noqa: F401 (fixtures)
 
 from pipeline.config import parse
 from pipeline.errors import UserError
-from pipeline.stage import Item, Record
+from pipeline.keys import canonical
+from pipeline.stage import Record
 from stages.arrays import unpack_arrays
+from stages.geometry import colours, load
 from stages.records import PATCH_INSIDE, PATCH_KEPT, MeshRecord, SceneRecord, TextureRecord, patch_means
 from stages.rendering.render import render_views
+from stages.s00_collect import Collect, made_up_texture
+from stages.s03_scene import SampleScene, SceneConfig, SceneCount
 from stages.scenes import textures
+from stages.scenes.laws import TextureLaw
 from stages.tonemap import from_picture, to_picture
 
 ROW, COLUMN = np.indices((32, 32))
@@ -98,7 +108,9 @@ def test_a_remeshed_surface_gets_the_colours_of_the_nearest_points():
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     uv = np.array([[[0, 1], [1, 1], [1, 0]], [[0, 1], [1, 0], [0, 0]]])  # image upright: v runs down, y up
     one = np.zeros(1, np.int16)
-    texture = TextureRecord("a", uv, np.zeros(2, np.int16), np.float32([[0.5, 1, 1]]), one, np.zeros((1, 2), np.uint8), [ramp()])
+    texture = TextureRecord(
+        "a", uv, np.zeros(2, np.int16), np.float32([[0.5, 1, 1]]), one, np.zeros((1, 2), np.uint8), [ramp()]
+    )
     rng = np.random.default_rng(0)
     triangles = rng.uniform(0.1, 0.9, (5, 3, 3)) * [1, 1, 0] - [0, 0, 0.01]
     got = textures.transfer(texture, corners, faces, triangles)
@@ -123,6 +135,236 @@ def test_hidden_faces_lend_no_colours():
     below = vertices[faces[:half]] * 0.983  # nearer to the inner box
     assert textures.transfer(texture, vertices, faces, below)[:, PATCH_INSIDE, 1].min() > 0.99
     assert textures.transfer(texture, vertices, faces, below, seen)[:, PATCH_INSIDE, 0].min() > 0.99
+
+
+# --- collect: images of strangers' files ------------------------------------------------------------------------------
+
+
+def png(pixels: np.ndarray, claimed: tuple[int, int] | None = None) -> bytes:
+    """A PNG file; ``claimed``: a width and height that its header states instead of its own."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="png")
+    data = bytearray(buffer.getvalue())
+    if claimed:
+        data[16:24] = struct.pack(">II", *claimed)
+        data[29:33] = struct.pack(">I", zlib.crc32(bytes(data[12:29])))
+    return bytes(data)
+
+
+RED_GREEN = np.uint8([[[255, 0, 0], [0, 255, 0]]] * 2)  # left red, right green
+UV = np.where(CORNERS[:, :1] > 5, [[0.75, 0.5]], [[0.25, 0.5]]).astype("<f4")  # low x red, high x green
+
+
+def textured_gltf(image: dict, **changes) -> bytes:
+    """The box of test_collect with texture coordinates and one image."""
+    tree = gltf(**changes)
+    tree["accessors"].append({"bufferView": 2, "componentType": 5126, "count": len(UV), "type": "VEC2"})
+    tree["bufferViews"].append({"buffer": 1, "byteLength": UV.nbytes})
+    uri = "data:application/octet-stream;base64," + base64.b64encode(UV.tobytes()).decode()
+    tree["buffers"].append({"byteLength": UV.nbytes, "uri": uri})
+    primitive = tree["meshes"][0]["primitives"][0]
+    primitive["attributes"]["TEXCOORD_0"], primitive["material"] = 2, 0
+    tree |= {"images": [image], "textures": [{"source": 0, "sampler": 0}], "samplers": [{"wrapS": 33071}]}
+    tree["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 0.5, 1, 1]}}]
+    return json.dumps(tree).encode()
+
+
+def data_uri(data: bytes) -> dict:
+    return {"uri": "data:image/png;base64," + base64.b64encode(data).decode()}
+
+
+def load_textured(path):
+    return load.load_mesh(path, path.parent, 1 << 24, 50_000, textures=True)
+
+
+def corner_colours(loaded: load.Loaded) -> np.ndarray:
+    """(F, 3, 3) linear colours at the corners."""
+    t = loaded.texture
+    looked = [textures.look_up(t.images[t.image[0]], uv, tuple(t.wrap[0])) for uv in t.uv]
+    return np.array(looked) * t.colour[0]
+
+
+def test_gltf_and_obj_keep_their_images_on_the_right_corners(tmp_path):
+    (tmp_path / "a.gltf").write_bytes(textured_gltf(data_uri(png(RED_GREEN))))
+    lines = ["mtllib a.mtl", *("v " + words(v) for v in CORNERS), *(f"vt {u} {v}" for u, v in UV), "usemtl paint"]
+    lines += ["f " + " ".join(f"{i}/{i}" for i in f + 1) for f in FACES]
+    (tmp_path / "a.obj").write_text("\n".join(lines) + "\n")
+    (tmp_path / "a.mtl").write_text("newmtl paint\nKd 0 0 0\nmap_Kd -clamp on maps/red green.png\n".replace("red green", "rg"))
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "rg.png").write_bytes(png(RED_GREEN))
+    for name, green in (("a.gltf", 0.5), ("a.obj", 1.0)):  # the glTF has a base colour factor; Kd beside an image means nothing
+        loaded = load_textured(tmp_path / name)
+        right = loaded.vertices[loaded.faces][..., 0] > 5
+        expected = np.where(right[..., None], [0, green, 0], [1, 0, 0])
+        assert np.allclose(corner_colours(loaded), expected, atol=1e-6), name
+        assert TextureRecord.WRAPS[loaded.texture.wrap[0, 0]] == "clamp"
+        plain = load.load_mesh(tmp_path / name, tmp_path, 1 << 24, 50_000)
+        assert plain.texture is None
+        assert np.array_equal(plain.vertices, loaded.vertices) and np.array_equal(plain.faces, loaded.faces)
+
+
+@pytest.mark.parametrize(
+    ("image", "note"),
+    [
+        (data_uri(b"not an image"), "UnidentifiedImageError"),
+        (data_uri(png(RED_GREEN)[:60]), "Error"),
+        (data_uri(png(RED_GREEN, claimed=(60000, 60000))), "60000 x 60000 pixels"),
+        ({"uri": "../secret.png"}, "refers to"),
+        ({"uri": "/etc/secret.png"}, "refers to"),
+        ({"uri": "link.png"}, "refers to"),
+        ({"uri": "notes.txt"}, "not one of"),
+        ({"uri": "none.png"}, "missing"),
+        ({"bufferView": 99}, "range"),
+        ({}, "uri"),
+    ],
+)
+def test_a_bad_image_costs_its_colour_and_not_the_mesh(tmp_path, image, note):
+    (tmp_path / "secret.png").write_bytes(png(RED_GREEN))
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "notes.txt").write_bytes(png(RED_GREEN))
+    (root / "link.png").symlink_to(tmp_path / "secret.png")
+    (root / "a.gltf").write_bytes(textured_gltf(image))
+    loaded = load_textured(root / "a.gltf")
+    assert len(loaded.faces) == 12 and loaded.texture is None
+    assert len(loaded.notes) == 1 and note in loaded.notes[0]
+
+
+def test_broken_texture_coordinates_cost_the_colours_and_not_the_mesh(tmp_path):
+    tree = json.loads(textured_gltf(data_uri(png(RED_GREEN))))
+    tree["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = 77
+    (tmp_path / "a.gltf").write_text(json.dumps(tree))
+    loaded = load_textured(tmp_path / "a.gltf")
+    assert len(loaded.faces) == 12 and loaded.texture is None and loaded.notes
+
+
+def test_large_images_are_averaged_in_linear_light():
+    checks = np.zeros((2048, 1500, 3), np.uint8)
+    checks[::2, ::2] = checks[1::2, 1::2] = 255
+    kept = colours.decode_image(png(checks))
+    assert kept.shape == (1024, 750, 3) and abs(from_picture(kept).mean() - 0.5) < 0.01
+    deep = io.BytesIO()
+    Image.fromarray(np.full((4, 4), 0x8000, np.uint16)).save(deep, format="png")
+    assert (colours.decode_image(deep.getvalue()) == 128).all()  # 16 bits
+
+
+def test_material_colours_alone_are_base_colours(shared_data):
+    """A tractor without images shows the colours of its materials; a bowl of one colour has nothing to show."""
+    market = shared_data / "meshes" / "market"
+    tractor, bowl = (load_textured(market / name) for name in ("tractor.gltf", "bowl.gltf"))
+    assert len(tractor.texture.colour) == 7 and tractor.texture.images == [] and bowl.texture is None
+
+
+def test_a_folder_with_textures_keeps_its_meshes_and_knows_its_images(tmp_path):
+    (tmp_path / "in").mkdir()
+    for number in range(6):
+        stretched = CORNERS * [1, 1 + number, 1]
+        image = {"uri": "paint.png"} if number else data_uri(png(RED_GREEN))
+        (tmp_path / "in" / f"{number}.gltf").write_bytes(textured_gltf(image, vertices=stretched))
+    (tmp_path / "in" / "paint.png").write_bytes(png(RED_GREEN))
+
+    def collect(textures: bool):
+        config = parse(Collect.Config, {"name": "folder", "path": str(tmp_path / "in"), "textures": textures}, "collect")
+        stage = Collect()
+        worker = stage.open(config, {}, {})
+        records = [("", record) for item in stage.items(config, {}) for record in stage.process(worker, item)]
+        draft = FakeArtifact(tmp_path / f"out{textures}", records)
+        stage.finish(config, {}, draft)
+        return config, draft, stage.identity(config, lambda path: path.read_bytes().hex())
+
+    (_, plain, _), (config, kept, before) = collect(False), collect(True)
+    assert len(plain.ids()) == 6 and len(kept.ids()) == 12
+    assert all(kept.read(id).members == plain.read(id).members for id in plain.ids())  # remesh need not run again
+    assert kept.file("objects.json").read_bytes() == plain.file("objects.json").read_bytes()
+    assert not plain.file("textures.json").exists()
+    assert {entry["textured"] for entry in json.loads(kept.file("textures.json").read_text()).values()} == {True}
+    record = kept.read(kept.ids()[1])
+    assert TextureRecord.from_record(record).to_record().members == record.members
+    (tmp_path / "in" / "paint.png").write_bytes(png(RED_GREEN[:, ::-1]))
+    after = Collect().identity(config, lambda path: path.read_bytes().hex())
+    changed = [name for name in before["items"] if before["items"][name] != after["items"][name]]
+    assert changed == [f"{number}.gltf" for number in range(1, 6)]  # another image is another object
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def scene_inputs(tmp_path):
+    """Blobs, of which the second of each split has no base colours."""
+    decimate, records = decimated(tmp_path / "decimate"), []
+    for id in decimate.ids():
+        vertices, faces = blob(7, int(id[-1]))
+        records.append(("", MeshRecord(id, vertices, faces, {}).to_record()))
+        texture = made_up_texture(vertices, faces, np.random.default_rng(3))
+        texture.id = id + TextureRecord.SUFFIX
+        if not id.endswith("blob1"):
+            records.append(("", texture.to_record()))
+    collect = FakeArtifact(tmp_path / "collect", records)
+    return {"decimate": decimate, "collect": collect}
+
+
+def sampled(config, inputs):
+    stage = SampleScene()
+    worker = stage.open(config, inputs, {})
+    return [SceneRecord.from_record(next(iter(stage.process(worker, item)))) for item in stage.items(config, inputs)]
+
+
+def test_textured_scenes_follow_their_law_and_leave_the_rest_alone(tmp_path):
+    inputs = scene_inputs(tmp_path)
+    inputs["collect"].file("textures.json").write_text("{}")
+    count = SceneCount(train=24, validation=0, test=0)
+    plain = sampled(SceneConfig(count=count), inputs)
+    config = SceneConfig(count=count, textures=TextureLaw(share=0.6, wall_share=0.3))
+    scenes = sampled(config, inputs)
+    states = Counter()
+    for before, scene in zip(plain, scenes, strict=True):
+        assert before.patches is None
+        untouched = ("triangles", "vertex_normals", "emission", "light_index", "object_index", "camera_to_world", "fov_deg")
+        assert all(np.array_equal(getattr(before, name), getattr(scene, name)) for name in untouched)
+        mine = np.zeros(len(scene.triangles), bool) if scene.patch_index is None else scene.patch_index >= 0
+        for number, (old, new) in enumerate(zip(before.meta["objects"], scene.meta["objects"], strict=True)):
+            faces = scene.object_index == number
+            states[new["kind"], new.get("textured", "texture" in new)] += 1
+            if new.get("object_id", "").endswith("blob1"):
+                assert new.get("textured") in (None, False)
+            if "texture" not in new:
+                assert not mine[faces].any() and old == {k: v for k, v in new.items() if k != "textured"}
+                assert all(
+                    np.array_equal(getattr(before, n)[faces], getattr(scene, n)[faces]) for n in ("diffuse", "roughness")
+                )
+                continue
+            assert mine[faces].all()
+            patches = scene.patches[scene.patch_index[faces]].astype(float)
+            material = new["material"]
+            assert patches[:, :3].max() <= material["bound"] + 1e-3 and patches[:, :3].std() > 0
+            assert (patches[:, :3].max(axis=1) + patches[:, 3]).max() <= 1 + 1e-3
+            assert np.allclose(scene.specular[faces], material["specular"], atol=1e-3)
+            assert np.allclose(scene.diffuse[faces], patches[:, :3, PATCH_INSIDE].mean(axis=2), atol=1e-3)
+    assert (
+        states["object", True] > 5 and states["object", False] > 5 and states["wall", True] > 5 and states["wall", False] > 20
+    )
+
+    stage, draft = SampleScene(), FakeArtifact(tmp_path / "draft", [("", scene.to_record()) for scene in scenes])
+    stage.finish(config, inputs, draft)
+    told = draft.notes["scenes"]["textures"]
+    assert told["object_without_base_colours"] > 0 and told["wall_textured"] == states["wall", True]
+    assert [s.to_record().members for s in sampled(config, inputs)] == [s.to_record().members for s in scenes]
+
+
+def test_textures_need_collected_colours_and_only_then_read_collect(tmp_path):
+    stage, inputs = SampleScene(), scene_inputs(tmp_path)
+
+    def missing(name):
+        raise UserError(f"there is no file {name}")
+
+    inputs["collect"].file = missing
+    config = SceneConfig(textures=TextureLaw(share=0.5))
+    with pytest.raises(UserError, match="collect.textures=true"):
+        list(stage.items(config, inputs))
+    walls = SceneConfig(textures=TextureLaw(wall_share=0.5))
+    assert stage.reads(config) == ("collect", "decimate") and stage.reads(walls) == stage.reads(SceneConfig()) == ("decimate",)
+    assert "textures" not in canonical(SceneConfig()) and "textures" in canonical(walls)
+    assert "textures" not in canonical(parse(Collect.Config, {"name": "procedural"}, "collect"))
 
 
 # --- records ----------------------------------------------------------------------------------------------------------
