@@ -207,8 +207,9 @@ def test_gltf_and_obj_keep_their_images_on_the_right_corners(tmp_path):
     ("image", "note"),
     [
         (data_uri(b"not an image"), "UnidentifiedImageError"),
-        (data_uri(png(RED_GREEN)[:60]), "Error"),
-        (data_uri(png(RED_GREEN, claimed=(60000, 60000))), "60000 x 60000 pixels"),
+        (data_uri(png(RED_GREEN)[:44]), "Error"),
+        (data_uri(png(RED_GREEN, claimed=(9000, 9000))), "9000 x 9000 pixels"),
+        (data_uri(png(RED_GREEN, claimed=(60000, 60000))), "DecompressionBomb"),
         ({"uri": "../secret.png"}, "refers to"),
         ({"uri": "/etc/secret.png"}, "refers to"),
         ({"uri": "link.png"}, "refers to"),
@@ -289,15 +290,18 @@ def test_a_folder_with_textures_keeps_its_meshes_and_knows_its_images(tmp_path):
 # --- scenes -----------------------------------------------------------------------------------------------------------
 
 
+BARE = ("blob1", "blob2")  # those without base colours
+
+
 def scene_inputs(tmp_path):
-    """Blobs, of which the second of each split has no base colours."""
+    """Blobs, some with a pattern."""
     decimate, records = decimated(tmp_path / "decimate"), []
     for id in decimate.ids():
         vertices, faces = blob(7, int(id[-1]))
         records.append(("", MeshRecord(id, vertices, faces, {}).to_record()))
         texture = made_up_texture(vertices, faces, np.random.default_rng(3))
         texture.id = id + TextureRecord.SUFFIX
-        if not id.endswith("blob1"):
+        if not id.endswith(BARE):
             records.append(("", texture.to_record()))
     collect = FakeArtifact(tmp_path / "collect", records)
     return {"decimate": decimate, "collect": collect}
@@ -312,9 +316,9 @@ def sampled(config, inputs):
 def test_textured_scenes_follow_their_law_and_leave_the_rest_alone(tmp_path):
     inputs = scene_inputs(tmp_path)
     inputs["collect"].file("textures.json").write_text("{}")
-    count = SceneCount(train=24, validation=0, test=0)
-    plain = sampled(SceneConfig(count=count), inputs)
-    config = SceneConfig(count=count, textures=TextureLaw(share=0.6, wall_share=0.3))
+    kept = {"count": SceneCount(train=16, validation=0, test=0), "max_triangles": 640}
+    plain = sampled(SceneConfig(**kept), inputs)
+    config = SceneConfig(**kept, textures=TextureLaw(share=0.6, wall_share=0.3))
     scenes = sampled(config, inputs)
     states = Counter()
     for before, scene in zip(plain, scenes, strict=True):
@@ -325,13 +329,12 @@ def test_textured_scenes_follow_their_law_and_leave_the_rest_alone(tmp_path):
         for number, (old, new) in enumerate(zip(before.meta["objects"], scene.meta["objects"], strict=True)):
             faces = scene.object_index == number
             states[new["kind"], new.get("textured", "texture" in new)] += 1
-            if new.get("object_id", "").endswith("blob1"):
+            if new.get("object_id", "").endswith(BARE):
                 assert new.get("textured") in (None, False)
             if "texture" not in new:
                 assert not mine[faces].any() and old == {k: v for k, v in new.items() if k != "textured"}
-                assert all(
-                    np.array_equal(getattr(before, n)[faces], getattr(scene, n)[faces]) for n in ("diffuse", "roughness")
-                )
+                for name in ("diffuse", "specular", "roughness"):
+                    assert np.array_equal(getattr(before, name)[faces], getattr(scene, name)[faces])
                 continue
             assert mine[faces].all()
             patches = scene.patches[scene.patch_index[faces]].astype(float)
@@ -340,15 +343,14 @@ def test_textured_scenes_follow_their_law_and_leave_the_rest_alone(tmp_path):
             assert (patches[:, :3].max(axis=1) + patches[:, 3]).max() <= 1 + 1e-3
             assert np.allclose(scene.specular[faces], material["specular"], atol=1e-3)
             assert np.allclose(scene.diffuse[faces], patches[:, :3, PATCH_INSIDE].mean(axis=2), atol=1e-3)
-    assert (
-        states["object", True] > 5 and states["object", False] > 5 and states["wall", True] > 5 and states["wall", False] > 20
-    )
+    assert min(states[kind, flag] for kind in ("object", "wall") for flag in (True, False)) > 2
 
     stage, draft = SampleScene(), FakeArtifact(tmp_path / "draft", [("", scene.to_record()) for scene in scenes])
     stage.finish(config, inputs, draft)
     told = draft.notes["scenes"]["textures"]
     assert told["object_without_base_colours"] > 0 and told["wall_textured"] == states["wall", True]
-    assert [s.to_record().members for s in sampled(config, inputs)] == [s.to_record().members for s in scenes]
+    again = sampled(config.model_copy(update={"count": SceneCount(train=3, validation=0, test=0)}), inputs)
+    assert [s.to_record().members for s in again] == [s.to_record().members for s in scenes[:3]]
 
 
 def test_textures_need_collected_colours_and_only_then_read_collect(tmp_path):
