@@ -65,7 +65,7 @@ class TextureRecord:
 
     id: the mesh's, with ``TextureRecord.SUFFIX``. F faces are those of the mesh, in its order; M materials, I images.
     uv: (F, 3, 2) float32 per corner; (0, 0) is the upper left corner of the image, v runs down (glTF's convention).
-    material: (F,) int16, a row of the following. colour: (M, 3) float32, linear factor of the image or the colour itself.
+    material: (F,) int32, a row of the following. colour: (M, 3) float32, linear factor of the image or the colour itself.
     image: (M,) int16 into ``images``, -1 = none. wrap: (M, 2) uint8 along u and v, an index into ``WRAPS``.
     images: (H, W, 3) uint8 each, sRGB, row 0 on top.
     """
@@ -80,7 +80,7 @@ class TextureRecord:
 
     SUFFIX = "-texture"
     WRAPS = ("repeat", "clamp", "mirror")
-    DTYPES = {"uv": np.float32, "material": np.int16, "colour": np.float32, "image": np.int16, "wrap": np.uint8}
+    DTYPES = {"uv": np.float32, "material": np.int32, "colour": np.float32, "image": np.int16, "wrap": np.uint8}
 
     def to_record(self) -> Record:
         arrays = {name: np.asarray(getattr(self, name)).astype(dtype) for name, dtype in self.DTYPES.items()}

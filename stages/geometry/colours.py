@@ -9,10 +9,13 @@ is kept is at most ``MAX_SIDE`` pixels wide, averaged in linear light.
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 import json
 import re
+import struct
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +41,14 @@ class Material:
     colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
     image: np.ndarray | None = None  # (H, W, 3) uint8 sRGB
     wrap: tuple[str, str] = ("repeat", "repeat")
-    transform: np.ndarray = field(default_factory=lambda: np.eye(3)[:2])  # (2, 3) of (u, v, 1) as glTF has them
+    transform: np.ndarray = field(default_factory=lambda: np.eye(3)[:2])  # (2, 3) of (u, v, 1) as the file has them
+
+    @cached_property
+    def picture(self) -> str:
+        """What tells the image from others; "" where there is none."""
+        if self.image is None:
+            return ""
+        return hashlib.blake2b(self.image.tobytes(), digest_size=16).hexdigest() + str(self.image.shape)
 
 
 # -- images
@@ -141,14 +151,13 @@ def side_files(path: Path, root: Path) -> list[Path]:
                     if "map" in material:
                         add(material["map"], IMAGE_FORMATS)
         elif path.suffix.lower() in (".gltf", ".glb"):
-            from stages.geometry.load import split_glb
-
-            data = path.read_bytes()
-            tree = split_glb(data)[0] if path.suffix.lower() == ".glb" else json.loads(data)
+            with open(path, "rb") as file:  # of a GLB only its first chunk, the JSON
+                head = file.read(20) if path.suffix.lower() == ".glb" else b""
+                tree = json.loads(file.read(struct.unpack_from("<I", head, 12)[0] if head else -1))
             for image in tree.get("images", []):
                 if not image.get("uri", "data:").startswith("data:"):
                     add(image["uri"], IMAGE_FORMATS)
-    except (Reject, ValueError, OSError, AttributeError, TypeError, KeyError, IndexError):
+    except (Reject, ValueError, OSError, AttributeError, TypeError, KeyError, IndexError, struct.error):
         pass  # the file itself is rejected when it is read
     return sorted(found)
 
@@ -282,24 +291,23 @@ def _gltf_material(
 def texture_record(id: str, parts: list[tuple[Material, np.ndarray | None, int]], kept: np.ndarray) -> TextureRecord | None:
     """The record of a mesh's parts, each (material, (f, 3, 2) corner coordinates or None, f), of the faces ``kept``.
 
-    ``kept``: indices into the faces of all parts together. Equal images and equal materials become one. None where there is
-    neither an image nor a second colour.
+    ``kept``: rising indices into the faces of all parts together. Equal images and equal materials become one. None where
+    there is neither an image nor a second colour.
     """
     coordinates = np.concatenate([np.zeros((count, 3, 2)) if uv is None else uv for _, uv, count in parts])[kept]
     coordinates = np.nan_to_num(coordinates, posinf=0, neginf=0)
-    part = np.repeat(np.arange(len(parts)), [count for _, _, count in parts])[kept]
+    ends = np.searchsorted(kept, np.cumsum([0, *(count for _, _, count in parts)]))
     rows: dict[tuple, int] = {}
-    images: dict[tuple, int] = {}
+    images: dict[str, int] = {}
     pictures: list[np.ndarray] = []
-    material = np.zeros(len(kept), np.int16)
-    for number, (look, uv, _) in enumerate(parts):
-        mine = part == number
-        if not mine.any():
+    material = np.zeros(len(kept), np.int32)
+    for (look, uv, _), start, end in zip(parts, ends, ends[1:], strict=False):
+        if start == end:
             continue
+        mine = slice(start, end)
         image, wrap = -1, (0, 0)
         if uv is not None and look.image is not None:
-            content = look.image.shape, look.image.tobytes()
-            image = images.setdefault(content, len(pictures))
+            image = images.setdefault(look.picture, len(pictures))
             if image == len(pictures):
                 pictures.append(look.image)
             wrap = tuple(TextureRecord.WRAPS.index(name) for name in look.wrap)

@@ -63,9 +63,8 @@ class _Part:
     def content(self) -> tuple:
         """What parts are put in order by: trimesh makes up names for unnamed nodes, other ones at each call."""
         look = self.material or colours.Material()
-        image = b"" if look.image is None else look.image.tobytes()
         uv = b"" if self.uv is None else self.uv.tobytes()
-        return self.points.tobytes(), self.triangles.tobytes(), uv, look.colour, image
+        return self.points.tobytes(), self.triangles.tobytes(), uv, look.colour, look.picture
 
 
 def load_mesh(path: Path, root: Path, max_bytes: int, max_faces: int, textures: bool = False) -> Loaded:

@@ -203,6 +203,24 @@ def test_gltf_and_obj_keep_their_images_on_the_right_corners(tmp_path):
         assert np.array_equal(plain.vertices, loaded.vertices) and np.array_equal(plain.faces, loaded.faces)
 
 
+def test_texture_transforms_and_integer_coordinates(tmp_path):
+    """An offset by half an image swaps the colours; so do 16-bit coordinates that say the same."""
+    tree = json.loads(textured_gltf(data_uri(png(RED_GREEN))))
+    tree["samplers"] = [{}]
+    texture = tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+    texture["extensions"] = {"KHR_texture_transform": {"offset": [0.5, 0]}}
+    (tmp_path / "a.gltf").write_text(json.dumps(tree))
+    small = np.round(UV * 65535).astype("<u2")
+    tree["accessors"][-1] |= {"componentType": 5123, "normalized": True}
+    tree["buffers"][1] = {"byteLength": small.nbytes, "uri": "data:;base64," + base64.b64encode(small.tobytes()).decode()}
+    tree["bufferViews"][2]["byteLength"] = small.nbytes
+    (tmp_path / "b.gltf").write_text(json.dumps(tree))
+    for name in ("a.gltf", "b.gltf"):
+        loaded = load_textured(tmp_path / name)
+        right = loaded.vertices[loaded.faces][..., 0] > 5
+        assert np.allclose(corner_colours(loaded), np.where(right[..., None], [1, 0, 0], [0, 0.5, 0]), atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("image", "note"),
     [
