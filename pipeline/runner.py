@@ -89,7 +89,7 @@ def make_plan(
             "stage": name,
             "version": stage.version,
             "params": params,
-            "inputs": {parent: plan[parent].key for parent in stage.inputs},
+            "inputs": {parent: plan[parent].key for parent in stage.reads(config)},
         }
         plan[name] = Planned(name, stage, config, digest_of(preimage), preimage)
     return plan
@@ -149,7 +149,7 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
             if run.plan:
                 out(f"{_label(system, name)} to make   key {planned.key[:12]}")
             else:
-                inputs = {parent: artifacts[parent] for parent in planned.stage.inputs}
+                inputs = {parent: artifacts[parent] for parent in planned.stage.reads(planned.config)}
                 assert all(inputs.values())
                 artifacts[name] = _make(run, system, planned, inputs, store, command, out)  # type: ignore[arg-type]
         elif artifact is not None:
@@ -175,7 +175,7 @@ def _todo(run: RunConfig, plan: Mapping[str, Planned], artifacts: Mapping[str, A
         if name in todo or (artifacts[name] is not None and not forced):
             return
         todo.add(name)
-        for parent in plan[name].stage.inputs:
+        for parent in plan[name].stage.reads(plan[name].config):
             need(parent, parent in run.force)
 
     for name in (*run.force, *run.stage):

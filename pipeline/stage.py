@@ -59,10 +59,17 @@ class Stage:
 
     name: ClassVar[str]
     version: ClassVar[int]  # bump when the same config gives other output
-    inputs: ClassVar[tuple[str, ...]] = ()  # names of the stages it reads
+    inputs: ClassVar[tuple[str, ...]] = ()  # names of the stages it reads, or may read (see ``reads``)
     Config: ClassVar[Any]  # a StageConfig, or a union of them told apart by `name`
     reasons: ClassVar[Mapping[str, str]] = {}  # closed list: reject reason -> what it means
     headline: ClassVar[str | None] = None  # the file under files/ whose path ends a run of this stage (a report)
+
+    def reads(self, config: StageConfig) -> tuple[str, ...]:
+        """Those of ``inputs`` that this config needs: all, unless a stage leaves out what only an option asks for.
+
+        The others enter neither the key nor the run.
+        """
+        return self.inputs
 
     def slug(self, config: StageConfig) -> str:
         """A few letters for people, at the head of the artifact's folder name."""

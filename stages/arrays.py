@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 
-def pack_arrays(arrays: dict[str, np.ndarray]) -> bytes:
-    """An uncompressed ``.npz`` of the arrays in sorted order (no clock in it: numpy dates members 1980)."""
+def pack_arrays(arrays: dict[str, np.ndarray], compressed: bool = False) -> bytes:
+    """An ``.npz`` of the arrays in sorted order (no clock in it: numpy dates members 1980)."""
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{name: np.ascontiguousarray(arrays[name]) for name in sorted(arrays)})
+    save = np.savez_compressed if compressed else np.savez
+    save(buffer, allow_pickle=False, **{name: np.ascontiguousarray(arrays[name]) for name in sorted(arrays)})
     return buffer.getvalue()
 
 

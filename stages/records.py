@@ -25,6 +25,11 @@ PATCH_CHANNELS: Mapping[str, slice] = {
     "emission": slice(10, 13),
 }
 PATCH_NORMAL = (0.5, 0.5, 1.0)  # the released format's constant tangent-space normal
+PATCH_SIDE = 32  # texels along a patch's legs
+TEXTURED_CHANNELS = 7  # the first channels, diffuse, specular and roughness, may change within a triangle
+_STEP = np.add.outer(np.arange(PATCH_SIDE), np.arange(PATCH_SIDE))  # row + column
+PATCH_INSIDE = _STEP < PATCH_SIDE  # texels whose centre lies inside the triangle, on its third side included
+PATCH_KEPT = _STEP <= PATCH_SIDE  # texels that bilinear lookup inside the triangle needs; the others are 0
 
 
 @dataclass
@@ -53,6 +58,43 @@ class MeshRecord:
 
 
 @dataclass
+class TextureRecord:
+    """What *collect* kept of an object's colours: base-colour images and how they lie on the mesh of the same name.
+
+    A record of its own beside the MeshRecord, so that textures change nothing of the mesh and of what is made from it.
+
+    id: the mesh's, with ``TextureRecord.SUFFIX``. F faces are those of the mesh, in its order; M materials, I images.
+    uv: (F, 3, 2) float32 per corner; (0, 0) is the upper left corner of the image, v runs down (glTF's convention).
+    material: (F,) int32, a row of the following. colour: (M, 3) float32, linear factor of the image or the colour itself.
+    image: (M,) int16 into ``images``, -1 = none. wrap: (M, 2) uint8 along u and v, an index into ``WRAPS``.
+    images: (H, W, 3) uint8 each, sRGB, row 0 on top.
+    """
+
+    id: str
+    uv: np.ndarray
+    material: np.ndarray
+    colour: np.ndarray
+    image: np.ndarray
+    wrap: np.ndarray
+    images: list[np.ndarray]
+
+    SUFFIX = "-texture"
+    WRAPS = ("repeat", "clamp", "mirror")
+    DTYPES = {"uv": np.float32, "material": np.int32, "colour": np.float32, "image": np.int16, "wrap": np.uint8}
+
+    def to_record(self) -> Record:
+        arrays = {name: np.asarray(getattr(self, name)).astype(dtype) for name, dtype in self.DTYPES.items()}
+        arrays |= {f"image{index}": image for index, image in enumerate(self.images)}
+        return Record(self.id, {"texture.npz": pack_arrays(arrays, compressed=True)})
+
+    @classmethod
+    def from_record(cls, record: Record) -> TextureRecord:
+        arrays = unpack_arrays(record.members["texture.npz"])
+        images = [arrays[f"image{index}"] for index in range(len(arrays) - len(cls.DTYPES))]
+        return cls(record.id, **{name: arrays[name] for name in cls.DTYPES}, images=images)
+
+
+@dataclass
 class SceneRecord:
     """A scene as the renderer and the model see it: the same arrays for both.
 
@@ -65,6 +107,13 @@ class SceneRecord:
     object_index: (F,) int16 into ``meta["objects"]`` (walls, objects and lights).
     camera_to_world: (V, 4, 4) float32. fov_deg: (V,) float32, full angle of the square image.
     meta: JSON. ``template``, ``law``, ``split``, ``objects`` [{name, kind: wall|object|light, object_id?, faces}].
+    patch_index: (F,) int32, the row of ``patches`` that a textured triangle reads, -1 where a triangle is constant; None in
+        scenes without textures.
+    patches: (T, 7, 32, 32) float16, channels 0..6 of PATCH_CHANNELS (diffuse, specular, roughness) as right-triangle patches;
+        normal and emission never change within a triangle. The centre of texel [row, column] has barycentric weight
+        (column + 0.5) / 32 of corner 1 and (row + 0.5) / 32 of corner 2; texels with row + column > 32 are 0. Looked up
+        bilinearly, clamped to the triangle. ``diffuse``, ``specular`` and ``roughness`` of a textured triangle hold the means
+        over the texels inside it (``patch_means``).
     """
 
     id: str
@@ -79,6 +128,8 @@ class SceneRecord:
     camera_to_world: np.ndarray
     fov_deg: np.ndarray
     meta: dict[str, Any] = field(default_factory=dict)
+    patch_index: np.ndarray | None = None
+    patches: np.ndarray | None = None
 
     DTYPES = {
         "triangles": np.float32,
@@ -92,6 +143,12 @@ class SceneRecord:
         "camera_to_world": np.float32,
         "fov_deg": np.float32,
     }
+    PATCH_DTYPES = {"patch_index": np.int32, "patches": np.float16}  # only in scenes with textured triangles
+
+    @property
+    def textured(self) -> bool:
+        """Whether any triangle reads a patch."""
+        return self.patch_index is not None and bool((self.patch_index >= 0).any())
 
     @property
     def n_lights(self) -> int:
@@ -99,10 +156,14 @@ class SceneRecord:
         return int(self.light_index.max(initial=-1)) + 1
 
     def arrays(self) -> dict[str, np.ndarray]:
-        return {name: np.asarray(getattr(self, name)).astype(dtype) for name, dtype in self.DTYPES.items()}
+        """What ``scene.npz`` holds; the patches only where a triangle reads one."""
+        dtypes = self.DTYPES | self.PATCH_DTYPES if self.textured else self.DTYPES
+        return {name: np.asarray(getattr(self, name)).astype(dtype) for name, dtype in dtypes.items()}
 
     def to_record(self) -> Record:
-        return Record(self.id, {"scene.npz": pack_arrays(self.arrays()), "meta.json": pack_json(self.meta)})
+        # patches are large and mostly repeat themselves: only scenes that have some are worth compressing
+        arrays = pack_arrays(self.arrays(), compressed=self.textured)
+        return Record(self.id, {"scene.npz": arrays, "meta.json": pack_json(self.meta)})
 
     @classmethod
     def from_members(cls, id: str, members: Mapping[str, bytes]) -> SceneRecord:
@@ -112,6 +173,17 @@ class SceneRecord:
     @classmethod
     def from_record(cls, record: Record) -> SceneRecord:
         return cls.from_members(record.id, record.members)
+
+
+def patch_means(patches: np.ndarray) -> dict[str, np.ndarray]:
+    """``diffuse`` (T, 3), ``specular`` (T, 3) and ``roughness`` (T,) float32 of (T, 7, 32, 32) patches: their means over
+    the texels inside the triangle."""
+    means = patches[:, :, PATCH_INSIDE].mean(axis=2, dtype=np.float64).astype(np.float32)
+    return {
+        "diffuse": means[:, PATCH_CHANNELS["diffuse"]],
+        "specular": means[:, PATCH_CHANNELS["specular"]],
+        "roughness": means[:, PATCH_CHANNELS["roughness"]][:, 0],
+    }
 
 
 @dataclass

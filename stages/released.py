@@ -4,8 +4,10 @@ JSON: transforms are taken as written (rotate about x, then y, then z, scale, tr
 subtracts the vertex mean and scales to radius 0.5). Meshes are read from the scene file's folder only. Smooth
 shading splits creases at 30 degrees. Random diffuse colours come from numpy's generator: their distribution is the
 format's, the colours are not its converter's.
-HDF5: 13-channel patches, constant per triangle; its colours are quantised to 8 bits by the released converter, and
-it does not name lights, so each connected group of emitting triangles is one light.
+HDF5: 13-channel patches; its colours are quantised to 8 bits by the released converter, and it does not name lights,
+so each connected group of emitting triangles is one light. Diffuse, specular and roughness may change within a
+triangle, normal and emission may not. All released files are constant, so how texels lie on a textured triangle is our
+reading: the last two axes are row and column as ``SceneRecord.patches`` says.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
-from stages.records import PATCH_CHANNELS, SceneRecord
+from stages.records import PATCH_CHANNELS, PATCH_KEPT, PATCH_SIDE, TEXTURED_CHANNELS, SceneRecord, patch_means
 
 CREASE_DEG = 30.0
 MIN_ROUGHNESS = 0.01
@@ -239,8 +241,9 @@ def load_hdf5(path: Path) -> SceneRecord:
             texture = file["texture"][...]
     except OSError as error:
         raise UserError(f"{path} is not an HDF5 file ({error})") from error
+    patch_index, patches = None, None
     if texture.ndim == 4:
-        texture = _constant(texture, path)
+        texture, patch_index, patches = _patches(texture, path)
     arrays["texture"] = texture.astype(np.float32)
     for name, tail in shapes.items():
         if arrays[name].shape[1:] != tail or len(arrays[name]) == 0:
@@ -272,17 +275,43 @@ def load_hdf5(path: Path) -> SceneRecord:
         arrays["c2w"],
         arrays["fov"],
         {"template": "released", "law": "released", "scene_name": path.stem, "objects": objects},
+        patch_index,
+        patches,
     )
 
 
-def _constant(texture: np.ndarray, path: Path) -> np.ndarray:
-    """(N, 13) from constant (N, 13, P, P) patches, whose cells with x + y > P are zero."""
+def _patches(texture: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """(N, 13) values of (N, 13, P, P) patches, whose cells with x + y > P count as zero; for textured triangles the means.
+
+    And ``patch_index`` and ``patches`` of a SceneRecord, None where every triangle is constant.
+    """
     side = texture.shape[-1]
+    if texture.shape[1:] != (13, side, side):
+        raise UserError(f"{path}: texture has shape {texture.shape}, expected (N, 13, {PATCH_SIDE}, {PATCH_SIDE})")
     kept = np.add.outer(np.arange(side), np.arange(side)) <= side
-    values = texture[:, :, 0, 0]
-    if texture.shape[-2] != side or not (texture[:, :, kept] == values[..., None]).all():
-        raise UserError(f"{path} has textured triangles: only constant patches can be path traced so far")
-    return values
+    values = texture[:, :, 0, 0].astype(np.float32)
+    varies = (texture[:, :, kept] != texture[:, :, :1, 0]).any(axis=2)  # (N, 13)
+    for name in ("normal", "emission"):
+        triangles = np.flatnonzero(varies[:, PATCH_CHANNELS[name]].any(axis=1))
+        if len(triangles):
+            raise UserError(
+                f"{path}: {name} changes within triangle {triangles[0]} (and {len(triangles) - 1} more): only diffuse, "
+                "specular and roughness may; make it constant or split the triangle"
+            )
+    rows = np.flatnonzero(varies.any(axis=1))
+    if len(rows) == 0:
+        return values, None, None
+    if side != PATCH_SIDE:
+        raise UserError(f"{path} has textured triangles of {side} x {side} texels: only {PATCH_SIDE} x {PATCH_SIDE} are read")
+    patches = np.where(PATCH_KEPT, texture[rows, :TEXTURED_CHANNELS], 0).astype(np.float32)
+    rough = PATCH_CHANNELS["roughness"]
+    patches[:, rough] = np.where(PATCH_KEPT, np.maximum(patches[:, rough], MIN_ROUGHNESS), 0)
+    patches = patches.astype(np.float16)
+    means = patch_means(patches)
+    values[rows, :TEXTURED_CHANNELS] = np.hstack([means["diffuse"], means["specular"], means["roughness"][:, None]])
+    index = np.full(len(texture), -1, np.int32)
+    index[rows] = np.arange(len(rows))
+    return values, index, patches
 
 
 def _light_groups(triangles: np.ndarray, emits: np.ndarray) -> np.ndarray:

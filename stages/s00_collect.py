@@ -1,9 +1,10 @@
 """Stage collect: meshes from a folder, from Objaverse or from made-up families, normalised, without duplicates, split.
 
 Reads source files; writes one MeshRecord per mesh and ``files/objects.json``, the catalogue of distinct objects with
-their splits. Design choice: nothing native sees a file before ``stages.geometry.load`` has checked it, and two files
-are one object when their surfaces agree within a tolerance, not when rounded numbers hash alike. Paper section 3.3
-(objects from Objaverse; the split is ours).
+their splits. With ``collect.textures`` also a TextureRecord beside each mesh that has base colours, and
+``files/textures.json``, which says what there is and what could not be had. Design choice: nothing native sees a file
+before ``stages.geometry.load`` has checked it, and two files are one object when their surfaces agree within a
+tolerance, not when rounded numbers hash alike. Paper section 3.3 (objects from Objaverse; the split is ours).
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from pipeline.config import StageConfig, count, runtime
+from pipeline.config import StageConfig, added, count, runtime
 from pipeline.errors import Reject, UserError
 from pipeline.keys import seed_for
 from pipeline.stage import Inputs, Item, MapStage, Record
-from stages.arrays import pack_json
-from stages.records import MeshRecord
+from stages.arrays import pack_json, unpack_json
+from stages.records import MeshRecord, TextureRecord
 
 if TYPE_CHECKING:
     from pipeline.store import Draft
@@ -34,6 +35,7 @@ class CollectConfig(StageConfig):
 
     max_bytes: int = Field(268435456, ge=1)  # of a file and of the buffers beside it
     max_faces: int = Field(2000000, ge=1)  # before processing
+    textures: bool = added(False, legacy=False)  # keep base colours and images, for scene.textures; the meshes stay the same
 
 
 class ProceduralConfig(CollectConfig):
@@ -117,12 +119,20 @@ class Collect(MapStage):
         return _Collector(config)
 
     def process(self, worker: Any, item: Item) -> Iterator[Record]:
-        yield worker.collect(item).to_record()
+        mesh, texture, notes = worker.collect(item)
+        yield mesh.to_record()
+        # beside the mesh, not in it: what was made of the mesh is not made again because colours were kept
+        members = dict(texture.to_record().members) if texture is not None else {}
+        if notes:
+            members["notes.json"] = pack_json(notes)
+        if members:
+            yield Record(mesh.id + TextureRecord.SUFFIX, members)
 
     def finish(self, config: StageConfig, inputs: Inputs, draft: Draft) -> None:
         from stages.geometry import catalogue
 
-        rows = {row.id: row for row in draft.rows()}
+        beside = {row.id for row in draft.rows() if row.id.endswith(TextureRecord.SUFFIX)}
+        rows = {row.id: row for row in draft.rows() if row.id not in beside}
         objects, signatures = {}, {}
         for name in sorted(rows):
             meta = MeshRecord.from_record(draft.read(name)).meta
@@ -148,6 +158,16 @@ class Collect(MapStage):
         splits = catalogue.fill_splits(list(objects.values()), held)
         listed = [{**objects[name], "split": splits[name]} for name in sorted(objects)]
         (draft.files / "objects.json").write_bytes(pack_json(listed))
+        if config.textures:
+            told = {}
+            for name in sorted(objects):
+                id = name + TextureRecord.SUFFIX
+                members = draft.read(id).members if id in beside else {}
+                notes = unpack_json(members["notes.json"]) if "notes.json" in members else []
+                told[name] = {"textured": "texture.npz" in members, "notes": notes}
+            (draft.files / "textures.json").write_bytes(pack_json(told))
+            number = sum(entry["textured"] for entry in told.values())
+            draft.note("textures", {"textured": number, "plain": len(told) - number})
         draft.note(
             "summary",
             {
@@ -166,7 +186,7 @@ CATALOGUE_FIELDS = ("object_id", "content_hash", "family", "source", "origin", "
 
 
 class _Collector:
-    """A worker: one source item to a normalised MeshRecord."""
+    """A worker: one source item to a normalised MeshRecord and, where asked for, its TextureRecord."""
 
     def __init__(self, config: StageConfig):
         self.config = config
@@ -176,7 +196,7 @@ class _Collector:
 
             self.notes = read_notes(_folder(config) / "README.md")
 
-    def collect(self, item: Item) -> MeshRecord:
+    def collect(self, item: Item) -> tuple[MeshRecord, TextureRecord | None, list[str]]:
         from stages.geometry import catalogue, load, measure
 
         meta: dict[str, Any] = {"family": "", "origin": "", "licence": "", "source": item.id}
@@ -189,17 +209,20 @@ class _Collector:
             vertices, faces = FAMILIES[family](rng)
             vertices, faces = load.checked(vertices, faces, config.max_faces)
             mesh, stem = load.Loaded(vertices, faces), item.id
+            if config.textures:
+                rng = np.random.default_rng(seed_for(config.seed, f"{Collect.name}.texture", item.id))
+                mesh.texture = made_up_texture(vertices, faces, rng)
             meta |= {"family": family, "source": "procedural", "origin": "made by lightmill", "licence": "CC0-1.0"}
         elif config.name == "folder":
             root = _folder(config)
-            mesh = load.load_mesh(root / item.id, root, config.max_bytes, config.max_faces)
+            mesh = load.load_mesh(root / item.id, root, config.max_bytes, config.max_faces, config.textures)
             stem = PurePosixPath(item.id).stem
             note = catalogue.note_for(item.id, self.notes)
             meta["licence"] = config.licence or mesh.about.get("licence") or note
             meta["origin"] = config.origin or mesh.about.get("origin") or note
         else:
             path, facts = _download(item.id)
-            mesh = load.load_mesh(path, path.parent, config.max_bytes, config.max_faces)
+            mesh = load.load_mesh(path, path.parent, config.max_bytes, config.max_faces, config.textures)
             stem = "objaverse"
             meta |= facts
         vertices = load.normalise(mesh.vertices)
@@ -211,7 +234,18 @@ class _Collector:
             "faces": len(mesh.faces),
             "signature": measure.signature(vertices, mesh.faces),
         }
-        return MeshRecord(name, vertices, mesh.faces.astype(np.int32), meta)
+        if mesh.texture is not None:
+            mesh.texture.id = name + TextureRecord.SUFFIX
+        return MeshRecord(name, vertices, mesh.faces.astype(np.int32), meta), mesh.texture, mesh.notes[:20]
+
+
+def made_up_texture(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generator) -> TextureRecord:
+    """A pattern on all sides of a made-up mesh."""
+    from stages.geometry.procedural import box_coordinates, pattern
+
+    uv = box_coordinates(vertices, faces, float(rng.uniform(1, 3))).astype(np.float32)
+    white, first = np.ones((1, 3), np.float32), np.zeros(1, np.int16)
+    return TextureRecord("", uv, np.zeros(len(faces), np.int16), white, first, np.zeros((1, 2), np.uint8), [pattern(rng)])
 
 
 # -- folder
@@ -246,7 +280,8 @@ def mesh_files(config: FolderConfig) -> list[str]:
 
 
 def _hashes(config: FolderConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
-    """Content of all that decides the output: per mesh file its hash and those of the buffers it names; the README."""
+    """Content of all that decides the output: per mesh file its hash and those of the buffers, and with textures of
+    the libraries and images, that it names; the README."""
     from stages.geometry import load
 
     root = _folder(config)
@@ -258,6 +293,11 @@ def _hashes(config: FolderConfig, hash_file: Callable[[Any], str]) -> dict[str, 
     for relative in mesh_files(config):
         path = root / relative
         buffers = {}
+        if config.textures and load.inside(path, root):
+            from stages.geometry.colours import side_files
+
+            names = [target.resolve().relative_to(root.resolve()).as_posix() for target in side_files(path, root)]
+            buffers = {name: content(name) for name in names}
         if path.suffix.lower() == ".gltf" and load.inside(path, root):
             for uri in load.buffer_files(path):
                 try:

@@ -118,6 +118,8 @@ FIELDS = """
 | scene.npz | diffuse | (F, 3) | float32 | diffuse albedo RGB, [0, 1] |
 | scene.npz | specular | (F, 3) | float32 | factor of the GGX lobe, RGB, [0, 1] |
 | scene.npz | roughness | (F,) | float32 | [0.01, 1]; GGX alpha = roughness^2 |
+| scene.npz | patch_index | (F,) | int32 | row of `patches`, -1 = constant; only in scenes with textured triangles |
+| scene.npz | patches | (T, 7, 32, 32) | float16 | diffuse, specular, roughness per texel [row, column], see below |
 | scene.npz | emission | (F, 3) | float32 | radiance RGB, >= 0, both sides emit; emitters reflect nothing |
 | scene.npz | light_index | (F,) | int16 | light 0..L-1, -1 where a triangle does not emit |
 | scene.npz | object_index | (F,) | int16 | into `objects` of meta.json |
@@ -139,6 +141,10 @@ def card(shards: dict[str, Any], index: dict[str, Any], objects: dict[str, Any])
         "",
         "Path-traced triangle scenes for RenderFormer. F triangles, V cameras, L lights, H x W pixels.",
         FIELDS,
+        "The centre of texel [row, column] of a patch has barycentric weight (column + 0.5) / 32 of corner 1 and "
+        "(row + 0.5) / 32 of corner 2; texels with row + column > 32 are 0. A textured triangle's diffuse, specular and "
+        "roughness are the means over the texels inside it.",
+        "",
     ]
     lines += [
         "## Counts",

@@ -3,7 +3,7 @@ runs.
 
 Reads one file and, for glTF, the buffers beside it, never anything outside the given root. trimesh parses; what it
 would follow or allocate on a file's word alone (materials, images, URIs, stated counts, node graphs) is checked or
-removed first.
+removed first. Base colours come along when they are asked for (``stages.geometry.colours``) and never cost a mesh.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from urllib.parse import unquote
 import numpy as np
 
 from pipeline.errors import Reject
+from stages.geometry import colours
+from stages.records import TextureRecord
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")  # what is looked for in a folder
 BUFFER_SUFFIX = ".bin"  # files that a glTF may keep its buffers in
@@ -44,10 +46,32 @@ class Loaded:
     faces: np.ndarray
     parts: int = 1
     about: dict[str, str] = field(default_factory=dict)  # origin and licence where the file states them
+    texture: TextureRecord | None = None  # base colours, if they were asked for and there are any; without an id
+    notes: list[str] = field(default_factory=list)  # what of the colours could not be had, and why
 
 
-def load_mesh(path: Path, root: Path, max_bytes: int, max_faces: int) -> Loaded:
-    """The checked mesh of a file inside ``root``; raises Reject with a reason of *collect*."""
+@dataclass
+class _Part:
+    """A part of a file in its place: points (V, 3), triangles (F, 3), and where they were asked for its base colour
+    and corner coordinates (F, 3, 2)."""
+
+    points: np.ndarray
+    triangles: np.ndarray
+    material: colours.Material | None = None
+    uv: np.ndarray | None = None
+
+    def content(self) -> tuple:
+        """What parts are put in order by: trimesh makes up names for unnamed nodes, other ones at each call."""
+        look = self.material or colours.Material()
+        uv = b"" if self.uv is None else self.uv.tobytes()
+        return self.points.tobytes(), self.triangles.tobytes(), uv, look.colour, look.picture
+
+
+def load_mesh(path: Path, root: Path, max_bytes: int, max_faces: int, textures: bool = False) -> Loaded:
+    """The checked mesh of a file inside ``root``; raises Reject with a reason of *collect*.
+
+    ``textures``: with its base colours. The mesh is the same with and without.
+    """
     path, root = Path(path), Path(root)
     if not inside(path, root):
         raise Reject("unsafe_path", f"{path.name} leads outside the folder")
@@ -58,24 +82,48 @@ def load_mesh(path: Path, root: Path, max_bytes: int, max_faces: int) -> Loaded:
         raise Reject("too_large", f"{size} bytes, at most {max_bytes} are read")
     data = path.read_bytes()
     kind = path.suffix.lower()
+    notes: list[str] = []
+    if textures and kind in (".glb", ".gltf", ".obj"):
+        try:
+            return _load(data, kind, path.parent, root, max_bytes, max_faces, colours.Images())
+        except Reject as error:  # a colour or texture coordinate cannot make a mesh fail: once more without
+            notes.append(f"{error.reason}: {error.detail}")
+    loaded = _load(data, kind, path.parent, root, max_bytes, max_faces, None)
+    loaded.notes = notes
+    return loaded
+
+
+def _load(
+    data: bytes, kind: str, folder: Path, root: Path, max_bytes: int, max_faces: int, images: colours.Images | None
+) -> Loaded:
+    """The mesh in the bytes of a file; with base colours where ``images`` collects them."""
     about: dict[str, str] = {}
+    materials: Any = None
     try:
         if kind in (".gltf", ".glb"):
-            data, about = _prepare_gltf(data, kind, path.parent, root, max_bytes, max_faces)
+            data, about, materials = _prepare_gltf(data, kind, folder, root, max_bytes, max_faces, images)
             kind = ".glb"
         elif kind == ".obj":
-            _check_obj(data, path.parent, root)
+            _check_obj(data, folder, root)
+            if images is not None:
+                materials = colours.obj_materials(data, folder, root, max_bytes, images)
         else:
             _check_counts(data, kind, max_faces)
-        vertices, faces, parts = _parse(data, kind)
+        parts = _parse(data, kind, materials)
     except Reject:
         raise
     except MemoryError:
         raise
     except Exception as error:  # parsers of strangers' files fail in every way: all of them mean "unreadable"
         raise Reject("unreadable", f"{type(error).__name__}: {str(error)[:200]}") from None
-    vertices, faces = checked(vertices, faces, max_faces)
-    return Loaded(vertices, faces, parts, about)
+    starts = np.cumsum([0, *(len(part.points) for part in parts[:-1])])
+    faces = np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=True)])
+    vertices, faces, kept = _settled(np.concatenate([part.points for part in parts]), faces, max_faces)
+    loaded = Loaded(vertices, faces, len(parts), about)
+    if images is not None:
+        looks = [(part.material or colours.Material(), part.uv, len(part.triangles)) for part in parts]
+        loaded.texture, loaded.notes = colours.texture_record("", looks, kept), images.notes
+    return loaded
 
 
 def inside(path: Path, root: Path) -> bool:
@@ -85,6 +133,11 @@ def inside(path: Path, root: Path) -> bool:
 
 def checked(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:
     """The mesh without unused vertices and zero-area triangles, or a Reject: safe for native code afterwards."""
+    return _settled(vertices, faces, max_faces)[:2]
+
+
+def _settled(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``checked``, and the indices of the faces that are left."""
     if len(faces) == 0 or len(vertices) == 0:
         raise Reject("no_faces", f"{len(vertices)} vertices, {len(faces)} faces")
     if len(faces) > max_faces:
@@ -106,7 +159,7 @@ def checked(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[np
     if double_area.sum() < 1e-8:
         raise Reject("degenerate", f"area {double_area.sum() / 2:.3g} of the squared longest side")
     used, faces = np.unique(faces[solid], return_inverse=True)
-    return vertices[used], faces.reshape(-1, 3)
+    return vertices[used], faces.reshape(-1, 3), np.flatnonzero(solid)
 
 
 def normalise(vertices: np.ndarray) -> np.ndarray:
@@ -127,12 +180,16 @@ def buffer_files(path: Path) -> list[str]:
 # -- parsing
 
 
-def _parse(data: bytes, kind: str) -> tuple[np.ndarray, np.ndarray, int]:
-    """(vertices, faces, parts) by trimesh, from memory: no resolver, so nothing else can be opened."""
+def _parse(data: bytes, kind: str, materials: Any = None) -> list[_Part]:
+    """The parts by trimesh, from memory: no resolver of files, so nothing else can be opened.
+
+    ``materials``: base colours, by name for OBJ, by number for glTF; None where they were not asked for.
+    """
     import trimesh
 
-    options: dict[str, Any] = {"skip_materials": True} if kind == ".obj" else {}
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind[1:], process=False, resolver=_Nothing(), **options)
+    options: dict[str, Any] = {"skip_materials": materials is None} if kind == ".obj" else {}
+    known = colours.library_without_images(materials) if kind == ".obj" and materials is not None else None
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind[1:], process=False, resolver=_Nothing(known), **options)
     parts = []
     for name in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[name]
@@ -147,20 +204,40 @@ def _parse(data: bytes, kind: str) -> tuple[np.ndarray, np.ndarray, int]:
             points = points @ transform[:3, :3].T + transform[:3, 3]
         if np.linalg.det(transform[:3, :3]) < 0:  # a mirrored node turns its faces inside out
             triangles = triangles[:, ::-1]
-        parts.append((points, triangles))
+        part = _Part(points, triangles)
+        if materials is not None:
+            part.material, uv = _look(mesh, kind, materials)
+            part.uv = None if uv is None else uv[triangles]
+        parts.append(part)
     if not parts:
         raise Reject("no_faces", "no part of it has a triangle")
-    # by content: trimesh makes up names for unnamed nodes, other ones at each call
-    parts.sort(key=lambda part: (part[0].tobytes(), part[1].tobytes()))
-    starts = np.cumsum([0, *(len(points) for points, _ in parts[:-1])])
-    faces = [triangles + start for (_, triangles), start in zip(parts, starts, strict=True)]
-    return np.concatenate([points for points, _ in parts]), np.concatenate(faces), len(parts)
+    return sorted(parts, key=_Part.content)
+
+
+def _look(mesh: Any, kind: str, materials: Any) -> tuple[colours.Material | None, np.ndarray | None]:
+    """A part's base colour and its (V, 2) texture coordinates, as far as it has them."""
+    if kind == ".obj":
+        look = materials.get(getattr(getattr(mesh.visual, "material", None), "name", None))
+        uv = getattr(mesh.visual, "uv", None)
+    else:
+        name = next((name for name in mesh.vertex_attributes if UV.match(name)), None)
+        if name is None:
+            return None, None
+        number, one = map(int, UV.match(name).groups())
+        look, uv = materials[number], np.asarray(mesh.vertex_attributes[name], np.float64) / one
+    usable = uv is not None and np.shape(uv) == (len(mesh.vertices), 2)
+    return look, np.asarray(uv, np.float64) if usable else None
 
 
 class _Nothing:
-    """A resolver that has no file: what trimesh asks for here is never geometry."""
+    """A resolver that has no file but, if any, one material library: what trimesh asks for here is never geometry."""
+
+    def __init__(self, library: bytes | None = None):
+        self.library = library
 
     def get(self, name: str) -> bytes:
+        if self.library is not None and name.lower().endswith(colours.LIBRARY_SUFFIX):
+            return self.library
         raise FileNotFoundError(name)
 
     __getitem__ = get
@@ -185,8 +262,8 @@ def check_path(uri: str, folder: Path, root: Path) -> Path:
 
 def _check_obj(data: bytes, folder: Path, root: Path) -> None:
     """An OBJ's faces need nothing else, but a material library outside its folder is a file not to trust."""
-    for line in re.findall(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", data, flags=re.MULTILINE):
-        check_path(line.decode("utf-8", "replace"), folder, root)
+    for name in colours.library_names(data):
+        check_path(name, folder, root)
     # trimesh takes an index past the end without a word in some layouts: count for ourselves
     count = len(re.findall(rb"^[ \t]*v[ \t]", data, flags=re.MULTILINE))
     highest = 0
@@ -227,13 +304,23 @@ def _check_counts(data: bytes, kind: str, max_faces: int) -> None:
 
 
 def _prepare_gltf(
-    data: bytes, kind: str, folder: Path, root: Path, max_bytes: int, max_faces: int
-) -> tuple[bytes, dict[str, str]]:
+    data: bytes,
+    kind: str,
+    folder: Path,
+    root: Path,
+    max_bytes: int,
+    max_faces: int,
+    images: colours.Images | None,
+) -> tuple[bytes, dict[str, str], list[colours.Material] | None]:
     """A self-contained GLB with the same triangles and nothing else: no materials, images, skins, cameras or outer
-    files."""
+    files.
+
+    Where ``images`` collects colours, also the materials; a primitive then carries the texture coordinates of its
+    material under a name that says which (``UV``).
+    """
     binary = b""
     if kind == ".glb":
-        tree, binary = _split_glb(data)
+        tree, binary = split_glb(data)
     else:
         tree = json.loads(data)
     if not isinstance(tree, dict) or not str(tree.get("asset", {}).get("version", "2")).startswith("2"):
@@ -262,16 +349,21 @@ def _prepare_gltf(
             raise Reject("unreadable", "a buffer view past the end of its buffer")
         view["buffer"] = 0
     _check_draco(tree, joined)
+    materials, sets = None, []
+    if images is not None:
+        materials, sets = colours.gltf_materials(tree, joined, folder, root, max_bytes, images)
     for name in ("materials", "textures", "images", "samplers", "skins", "cameras", "animations", "extensions"):
         tree.pop(name, None)
     for mesh in tree.get("meshes", []):
         for primitive in mesh["primitives"]:
-            primitive.pop("material", None)
+            number = primitive.pop("material", None)
             primitive.pop("targets", None)
-            # positions only: a colour or texture coordinate cannot make a mesh fail
-            primitive["attributes"] = {k: v for k, v in primitive["attributes"].items() if k == "POSITION"}
+            stated = primitive["attributes"]
+            primitive["attributes"] = {k: v for k, v in stated.items() if k == "POSITION"}
             extensions = primitive.get("extensions", {})
             primitive["extensions"] = {k: v for k, v in extensions.items() if k == DRACO}
+            if materials is not None and number is not None:
+                _keep_uv(tree, primitive, stated, int(number), sets[int(number)])
     for node in tree.get("nodes", []):
         for name in ("skin", "camera", "extensions"):
             node.pop(name, None)
@@ -279,10 +371,24 @@ def _prepare_gltf(
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(joined), 0x004E4942) + joined
-    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks, _gltf_about(tree)
+    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks, _gltf_about(tree), materials
 
 
-def _split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+UV = re.compile(r"_M(\d+)_(\d+)\Z")  # attribute of a prepared primitive: number of its material, what stands for 1
+
+
+def _keep_uv(tree: dict[str, Any], primitive: dict[str, Any], stated: dict[str, int], number: int, coordinates: int) -> None:
+    """Give the primitive its texture coordinates under a name that tells its material (positions where it has none)."""
+    source = f"TEXCOORD_{coordinates}"
+    accessor = tree["accessors"][stated[source]] if source in stated else {}
+    one = colours.INTEGER_UV.get(accessor.get("componentType"), 1) if accessor.get("normalized") else 1
+    primitive["attributes"][f"_M{number}_{one}"] = stated.get(source, stated["POSITION"])
+    draco = primitive["extensions"].get(DRACO, {}).get("attributes", {})
+    if source in draco:
+        draco[f"_M{number}_{one}"] = draco.pop(source)
+
+
+def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
     """(JSON, binary chunk) of a GLB."""
     magic, version, _ = struct.unpack_from("<III", data)
     if magic != 0x46546C67:

@@ -118,6 +118,13 @@ def signature(vertices: np.ndarray, faces: np.ndarray) -> list[float]:
 
 def sample(vertices: np.ndarray, faces: np.ndarray, number: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """(points (N, 3), unit normals (N, 3)): stratified by area, the same for the same mesh."""
+    return sample_with_faces(vertices, faces, number, seed)[:2]
+
+
+def sample_with_faces(
+    vertices: np.ndarray, faces: np.ndarray, number: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``sample``, and the face (N,) of each point."""
     rng = np.random.default_rng(seed)
     vectors = face_vectors(vertices, faces)
     double_areas = np.linalg.norm(vectors, axis=1)
@@ -126,7 +133,7 @@ def sample(vertices: np.ndarray, faces: np.ndarray, number: int, seed: int = 0) 
     u, v = np.sqrt(rng.random(number)), rng.random(number)
     weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
     points = np.einsum("nc,ncd->nd", weights, corners_of(vertices, faces[chosen]))
-    return points, vectors[chosen] / np.maximum(double_areas[chosen, None], 1e-300)
+    return points, vectors[chosen] / np.maximum(double_areas[chosen, None], 1e-300), chosen
 
 
 def sphere_directions(number: int = 64) -> np.ndarray:

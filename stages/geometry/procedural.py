@@ -489,6 +489,46 @@ def shelf(rng: np.random.Generator) -> Mesh:
     return join(*parts)
 
 
+# -- colours
+
+
+def pattern(rng: np.random.Generator) -> np.ndarray:
+    """A tile (128, 128, 3) uint8 sRGB that repeats without a seam: checks, stripes, dots or clouds of two to four colours."""
+    side = 128
+    x, y = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
+    colours = rng.uniform(0, 1, (4, 3))
+    number, kind = int(rng.integers(2, 7)), int(rng.integers(4))
+    if kind == 0:
+        level = (np.floor(2 * number * x) + np.floor(2 * number * y)) % 2
+    elif kind == 1:
+        level = np.floor(2 * number * ((rng.integers(1, 3) * x + rng.integers(0, 3) * y) % 1)) % 3
+    elif kind == 2:
+        radius = rng.uniform(0.2, 0.45)
+        u, v = number * x % 1 - 0.5, number * y % 1 - 0.5
+        level = np.where(np.hypot(u, v) < radius, 1 + (np.floor(number * x) + np.floor(number * y)) % 2, 0)
+    else:
+        level = np.full((side, side), 1.5)
+        for wave in rng.integers(-number, number + 1, (8, 2)):
+            level = level + 0.5 * np.sin(TURN * (wave[0] * x + wave[1] * y + rng.random()))
+        level = level.clip(0, 3)
+    low = np.floor(level).astype(int).clip(0, 2)
+    part = (level - low)[..., None]
+    return np.round(255 * (colours[low] * (1 - part) + colours[low + 1] * part)).astype(np.uint8)
+
+
+def box_coordinates(vertices: np.ndarray, faces: np.ndarray, repeats: float = 2.0) -> np.ndarray:
+    """(F, 3, 2) texture coordinates per corner: every face projected along the axis that its normal is nearest to.
+
+    ``repeats``: how often a tile repeats along the longest side of the bounding box.
+    """
+    corners = np.asarray(vertices, np.float64)[faces]
+    corners = (corners - corners.min(axis=(0, 1))) * (repeats / max(float(np.ptp(corners, axis=(0, 1)).max()), 1e-12))
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axis = np.abs(normal).argmax(axis=1)[:, None, None]
+    first, second = (np.take_along_axis(corners, np.repeat((axis + step) % 3, 3, axis=1), axis=2)[..., 0] for step in (1, 2))
+    return np.stack([first, second], axis=-1)
+
+
 FAMILIES: dict[str, Callable[[np.random.Generator], Mesh]] = {
     function.__name__: function
     for function in (

@@ -23,7 +23,7 @@ from stages.records import SceneRecord
 from stages.rendering.lights import SLOTS, LightTable
 from stages.rendering.sobol import Sampler, mixed
 from stages.rendering.sums import Sums
-from stages.rendering.surfaces import floats, surface_mesh
+from stages.rendering.surfaces import FirstHitAlbedo, floats, surface_mesh
 
 BLOCK = 8  # samples of a lane: also the steps in which samples can be asked for
 CHUNK = 1 << 19  # lanes in flight: 40 floats of results each, about 80 MB
@@ -148,7 +148,8 @@ def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide, diffuse_st
         sampler = Sampler(lanes.key ^ pass_key, number)
         dimension = bounce * DIMENSIONS
 
-        si = scene.ray_intersect(ray)
+        # without dPdUV: a frame that textures do not turn, so that the same samples go the same ways
+        si = scene.ray_intersect(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, False)
         found = si.is_valid()
         slot = dr.select(found, dr.gather(mi.Int32, lights.slot, si.prim_index, found), -1)
         on_light = slot >= 0
@@ -159,7 +160,7 @@ def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide, diffuse_st
         facing = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -1, 1)
         distance = dr.norm(si.p - origin)
         normals += dr.select(first, si.sh_frame.n * facing, 0)
-        albedos += dr.select(first, dr.gather(mi.Color3f, albedo, si.prim_index, first), 0)
+        albedos += dr.select(first, albedo.eval(si, first), 0)
         distances += dr.select(first, distance, 0)
         nearest = dr.minimum(nearest, dr.select(first, distance, dr.inf))
         hits += dr.select(first, 1, 0)
@@ -250,8 +251,7 @@ class JitRenderer:
         self.limits, self.lights_visible = limits, lights_visible
         mesh = surface_mesh(scene, np.arange(len(scene.triangles)))
         self.scene = mi.load_dict({"type": "scene", "surface": mesh})
-        emits = (scene.light_index >= 0)[:, None]
-        self.albedo = floats(np.where(emits, 0, scene.diffuse + scene.specular))
+        self.albedo = FirstHitAlbedo(scene)
         self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
         self.cameras = Cameras(scene, resolution, limits.filter)
 

@@ -5,7 +5,7 @@ A file per template of the scenes and kind of sheet, each about 1,100 pixels wid
 - ``contact-<template>.png``: `SCENES` scenes of every variant with all their views, a scene's with one exposure; below a view
   its samples per pixel and estimated error, or why it was dropped.
 - ``layers-<template>.png``: one view of one scene of every variant as it is stored: image, direct light, albedo, normal, depth,
-  coverage, and its lights one by one, all radiance with one exposure.
+  coverage, objects, triangles, and its lights one by one, all radiance with one exposure.
 
 Only the chosen scenes are read, view by view; the choice is by hash of the scene's id, so that it does not depend on the order
 and hardly changes when the dataset grows.
@@ -130,6 +130,8 @@ def _layer_blocks(view: ViewRecord, exposure: float) -> list[Image.Image]:
         _tile(_grey(fit(normal)), "normal, world"),
         _tile(_grey(fit(depth)), f"depth {near:.2f} to {far:.2f}"),
         _tile(_grey(fit(view.coverage)), "coverage"),
+        _tile(_colours(view.object), "object of the first sample"),
+        _tile(_colours(view.triangle), "triangle of the first sample"),
     ]
     blocks += [Image.new("RGB", (CELL, CELL + LINE), "white") for _ in range(COLUMNS - len(blocks))]
     for index, light in enumerate(view.lights[:COLUMNS]):
@@ -154,6 +156,16 @@ def fit(pixels: np.ndarray) -> np.ndarray:
         for channel in range(planes.shape[-1])
     ]
     return np.stack(small, axis=-1).reshape(TILE, TILE, *pixels.shape[2:])
+
+
+def _colours(indices: np.ndarray) -> np.ndarray:
+    """(h, w, 3) uint8: a colour for each of the (H, W) indices, black for -1; a large picture is thinned out."""
+    step = -(-len(indices) // TILE)
+    palette = np.random.default_rng(0).integers(64, 256, (257, 3))
+    palette[0] = 0
+    colours = palette[np.where(indices < 0, 0, 1 + indices % 256)][::step, ::step]
+    times = TILE // len(colours)
+    return colours.repeat(times, axis=0).repeat(times, axis=1).astype(np.uint8)
 
 
 def _meta(id: str, read: Read) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
-from stages.records import SceneRecord
+from stages.records import PATCH_CHANNELS, PATCH_SIDE, SceneRecord
 from stages.rendering import backend as backends
 
 HEIGHT = 1e-4  # scene units above a surface from where it is looked at
@@ -38,7 +38,7 @@ def texel_radiance(
     """Per light, the radiance that leaves the front of ``triangles`` (T indices) by diffuse reflection.
 
     Returns radiance (T, L, P, P, 3) float32, and (T, P, P) bool, which texels were met: a texel whose front another surface
-    covers within ``HEIGHT`` is not. A constant triangle's is its ``diffuse`` / pi times irradiance; needs a JIT backend.
+    covers within ``HEIGHT`` is not. It is diffuse reflectance / pi times irradiance; needs a JIT backend.
     """
     from stages.rendering.jit import JitRenderer, Limits
 
@@ -56,7 +56,19 @@ def texel_radiance(
     met = (sums["triangle"].reshape(len(faces), -1) == faces[:, None]) & (scene.light_index[faces] < 0)[:, None]
     arriving = sums["lights"].reshape(len(faces), len(weights), -1, 3) / spp * met[..., None, None]
     radiance = np.zeros((len(faces), scene.n_lights, size, size, 3), np.float32)
-    radiance[:, :, kept] = np.moveaxis(arriving * scene.diffuse[faces][:, None, None], 2, 1)
+    radiance[:, :, kept] = np.moveaxis(arriving * _diffuse(scene, faces, size)[:, kept][:, :, None], 2, 1)
     valid = np.zeros((len(faces), size, size), bool)
     valid[:, kept] = met
     return radiance, valid
+
+
+def _diffuse(scene: SceneRecord, faces: np.ndarray, size: int) -> np.ndarray:
+    """(T, P, P, 3) diffuse reflectance at the texel centres."""
+    from scipy.ndimage import map_coordinates
+
+    values = np.tile(scene.diffuse[faces][:, None, None], (1, size, size, 1)).astype(np.float32)
+    place = (np.indices((size, size)) + 0.5) * (PATCH_SIDE / size) - 0.5
+    for row in np.flatnonzero(scene.patch_index[faces] >= 0) if scene.textured else ():
+        patch = scene.patches[scene.patch_index[faces[row]], PATCH_CHANNELS["diffuse"]].astype(np.float32)
+        values[row] = np.stack([map_coordinates(channel, place, order=1, mode="nearest") for channel in patch], axis=-1)
+    return values

@@ -11,7 +11,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from stages.records import SceneRecord
+from stages.records import PATCH_SIDE, TEXTURED_CHANNELS, SceneRecord, patch_means
 from stages.scenes import meshes
 from stages.scenes.laws import Camera, MaterialLaw, Placement, Plan, draw_reflectance
 
@@ -87,24 +87,42 @@ def _reflectance(
     if material.vary:
         rng = np.random.default_rng(material.seed)
         if law.variation == "all_per_triangle":
-            diffuse, specular, roughness = draw_reflectance(law, rng, n)
+            diffuse, specular, roughness, _ = draw_reflectance(law, rng, n)
         else:
             patch = np.arange(n) if placement.kind == "wall" else groups
             diffuse = rng.uniform(0, max(material.diffuse), size=(patch.max() + 1, 3))[patch]
     return diffuse, np.repeat(specular[:, None], 3, axis=1), roughness
 
 
+def _told(placement: Placement) -> dict:
+    """A placement as the scene's meta tells it; what only concerns textures is left out where there is none."""
+    told = {key: value for key, value in asdict(placement).items() if key not in ("index", "shape")}
+    if placement.texture is None:
+        del told["texture"], told["material"]["bound"]
+    return told
+
+
 def assemble(
-    id: str, plan: Plan, object_meshes: list[meshes.Mesh], origins: list[dict], law: MaterialLaw, meta: dict
+    id: str,
+    plan: Plan,
+    object_meshes: list[meshes.Mesh],
+    origins: list[dict],
+    law: MaterialLaw,
+    meta: dict,
+    patches: dict[str, np.ndarray] | None = None,
 ) -> SceneRecord:
     """The scene's arrays; ``object_meshes`` are those of ``plan.objects`` at the chosen rungs.
 
     ``origins`` says in JSON where each of them comes from (object id, rung, licence) and enters the scene's meta.
+    ``patches``: name of a textured wall or object -> (F, 7, 32, 32) float16, see ``SceneRecord.patches``.
     """
+    patches = patches or {}
     columns: dict[str, list[np.ndarray]] = {
         name: [] for name in SceneRecord.DTYPES if name not in ("camera_to_world", "fov_deg")
     }
     described = []
+    rows = [np.zeros((0, TEXTURED_CHANNELS, PATCH_SIDE, PATCH_SIDE), np.float16)]
+    patch_index = []
 
     def add(entry: dict, **arrays: np.ndarray) -> None:
         faces = len(arrays["triangles"])
@@ -112,20 +130,26 @@ def assemble(
         for name, array in arrays.items():
             columns[name].append(array)
         described.append({**entry, "faces": faces})
+        mine = patches.get(entry["name"])
+        patch_index.append(np.full(faces, -1) if mine is None else sum(map(len, rows)) + np.arange(faces))
+        if mine is not None:
+            rows.append(mine)
 
     solid = [(wall, meshes.wall(wall.name)) for wall in plan.walls]
     solid += [(item, (normalize(v), f)) for item, (v, f) in zip(plan.objects, object_meshes, strict=True)]
     for placement, (template, faces) in solid:
         vertices = place(template.astype(np.float64), placement)
         groups = meshes.shading_groups(vertices, faces, law.crease_deg) if placement.material.smooth else np.arange(len(faces))
-        diffuse, specular, roughness = _reflectance(law, placement, groups, len(faces))
+        if placement.name in patches:  # the texture is the variation
+            reflectance = patch_means(patches[placement.name])
+        else:
+            names = ("diffuse", "specular", "roughness")
+            reflectance = dict(zip(names, _reflectance(law, placement, groups, len(faces)), strict=True))
         add(
-            {key: value for key, value in asdict(placement).items() if key not in ("index", "shape")},
+            _told(placement),
             triangles=vertices[faces],
             vertex_normals=meshes.smooth_normals(vertices, faces, groups),
-            diffuse=diffuse,
-            specular=specular,
-            roughness=roughness,
+            **reflectance,
             emission=np.zeros((len(faces), 3)),
             light_index=np.full(len(faces), -1),
         )
@@ -158,4 +182,6 @@ def assemble(
             "objects": described,
             "cameras": [asdict(camera) for camera in plan.cameras],
         },
+        patch_index=np.concatenate(patch_index).astype(np.int32) if patches else None,
+        patches=np.concatenate(rows) if patches else None,
     )

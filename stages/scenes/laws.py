@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from pipeline.config import Section
+from pipeline.config import Section, added
 from pipeline.errors import UserError
 
 Range = tuple[float, float]  # uniform between the two
@@ -164,6 +164,16 @@ class CameraLaw(Section):
     inside_fov_deg: Range = (50.0, 90.0)
 
 
+class TextureLaw(Section):
+    """Textures, beyond the paper's data: a textured surface has diffuse = s (1 - r) times the colour of its image.
+
+    Objects show the base colours that *collect* kept (``collect.textures``), special shapes and walls patterns made by code.
+    """
+
+    share: Share = 0.0  # of the objects; one without base colours stays as it is
+    wall_share: Share = 0.0  # of the walls
+
+
 @dataclass
 class Material:
     diffuse: list[float]
@@ -172,6 +182,7 @@ class Material:
     smooth: bool
     vary: bool  # whether parameters change within the object, see MaterialLaw.variation
     seed: int  # of that variation
+    bound: float = 0.0  # s (1 - r), what diffuse is of a white surface; told only where there is a texture
 
 
 @dataclass
@@ -186,6 +197,7 @@ class Placement:
     material: Material
     index: int = -1  # which object of the split
     shape: str = ""  # special shape made by code instead of an object
+    texture: int | None = None  # seed of a pattern; None: the surface has no texture
 
 
 @dataclass
@@ -237,6 +249,7 @@ class Laws(Section):
     material: MaterialLaw = MaterialLaw()
     lights: LightLaw = LightLaw()
     cameras: CameraLaw = CameraLaw()
+    textures: TextureLaw = added(TextureLaw(), legacy=TextureLaw())
 
 
 def draw_plan(laws: Laws, rng: np.random.Generator, n_objects: int) -> Plan:
@@ -251,11 +264,15 @@ def draw_plan(laws: Laws, rng: np.random.Generator, n_objects: int) -> Plan:
     plan.lights = draw_lights(laws.lights, rng, template)
     plan.cameras = [draw_camera(laws.cameras, rng, template) for _ in range(laws.cameras.views)]
     # generators of their own: what goes beyond the paper leaves the rest of a scene as it was
-    beyond_lights, beyond_cameras = rng.spawn(2)
+    beyond_lights, beyond_cameras, beyond_surfaces = rng.spawn(3)
     for light in plan.lights:
         _vary_light(laws.lights, beyond_lights, light)
     for camera in plan.cameras:
         _vary_camera(laws.cameras, beyond_cameras, camera)
+    for placement in (*plan.walls, *plan.objects):
+        chance, seed = beyond_surfaces.random(), int(beyond_surfaces.integers(2**31))
+        if chance < (laws.textures.wall_share if placement.kind == "wall" else laws.textures.share):
+            placement.texture = seed
     return plan
 
 
@@ -349,22 +366,23 @@ def _draw_objects(laws: Laws, rng: np.random.Generator, plan: Plan, n_objects: i
 
 
 def draw_material(law: MaterialLaw, rng: np.random.Generator, smooth_share: float) -> Material:
-    diffuse, specular, roughness = draw_reflectance(law, rng, 1)
+    diffuse, specular, roughness, bound = draw_reflectance(law, rng, 1)
     smooth = bool(rng.random() < smooth_share)
     vary = bool(rng.random() < law.variation_share)
     if law.variation == "diffuse_if_smooth":
         vary = vary and smooth
     seed = int(rng.integers(2**31))
-    return Material(diffuse[0].tolist(), float(specular[0]), float(roughness[0]), smooth, vary, seed)
+    return Material(diffuse[0].tolist(), float(specular[0]), float(roughness[0]), smooth, vary, seed, float(bound[0]))
 
 
-def draw_reflectance(law: MaterialLaw, rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``n`` materials: diffuse (n, 3), specular (n,) and roughness (n,)."""
+def draw_reflectance(law: MaterialLaw, rng: np.random.Generator, n: int) -> tuple[np.ndarray, ...]:
+    """``n`` materials: diffuse (n, 3), specular (n,), roughness (n,), and what diffuse would be of a white surface (n,)."""
     total, share = rng.uniform(*law.total, size=n), rng.uniform(*law.specular_share, size=n)
-    diffuse = (total * (1 - share))[:, None] * rng.uniform(*law.colour, size=(n, 3))
+    bound = total * (1 - share)
+    diffuse = bound[:, None] * rng.uniform(*law.colour, size=(n, 3))
     low, high = law.roughness
     roughness = np.exp(rng.uniform(math.log(low), math.log(high), size=n)) - law.roughness_shift
-    return diffuse, total * share, np.clip(roughness, 0.01, 1.0)
+    return diffuse, total * share, np.clip(roughness, 0.01, 1.0), bound
 
 
 def draw_lights(law: LightLaw, rng: np.random.Generator, template: str) -> list[Light]:

@@ -85,6 +85,16 @@ def test_record_ids_cannot_leave_their_folder(name):
 # -- running
 
 
+def test_an_input_that_only_an_option_reads_enters_no_other_key(run):
+    plain, _ = run()
+    assert set(plain["total"].manifest["preimage"]["inputs"]) == {"squares"}
+    both, lines = run(total={"plus_numbers": True})
+    assert set(both["total"].manifest["preimage"]["inputs"]) == {"numbers", "squares"}
+    assert sum("up to date" in line for line in lines) == 2
+    totals = [float(result["total"].file("total.txt").read_text()) for result in (plain, both)]
+    assert totals[1] > totals[0]
+
+
 def test_second_run_computes_nothing(run):
     first, _ = run()
     second, lines = run()

@@ -7,7 +7,7 @@ import signal
 import time
 from pathlib import Path
 
-from pipeline.config import StageConfig, count, runtime
+from pipeline.config import StageConfig, added, count, runtime
 from pipeline.errors import Reject
 from pipeline.keys import seed_for
 from pipeline.stage import Item, MapStage, Record, RunStage, System
@@ -97,18 +97,24 @@ class Squares(MapStage):
 
 class TotalConfig(StageConfig):
     steps: int = 3
+    plus_numbers: bool = added(False, legacy=False)
 
 
 class Total(RunStage):
     name = "total"
     version = 1
-    inputs = ("squares",)
+    inputs = ("numbers", "squares")
     Config = TotalConfig
     headline = "total.txt"
+
+    def reads(self, config):
+        return self.inputs if config.plus_numbers else ("squares",)
 
     def run(self, config, inputs, draft):
         squares = inputs["squares"]
         total = sum(float(squares.read(id).members["square.txt"]) for id in squares.ids())
+        if config.plus_numbers:
+            total += sum(float(inputs["numbers"].read(id).members["value.txt"]) for id in squares.ids())
         (draft.files / "total.txt").write_text(f"{total * config.steps}\n")
         return ["total.txt"]
 

@@ -190,8 +190,43 @@ def test_hdf5_lights_are_connected_groups(tmp_path):
         )
     scene = load_scene(tmp_path / "a.h5")
     assert scene.light_index.tolist() == [-1, 0, 1, 0, 1]
-    texture[0, 0, 0, 0] = 1
-    with h5py.File(tmp_path / "a.h5", "r+") as file:
-        file["texture"][...] = texture
-    with pytest.raises(UserError, match="textured"):
-        load_scene(tmp_path / "a.h5")
+    assert not scene.textured and scene.patches is None
+
+
+def test_hdf5_textures_are_read_and_what_may_not_change_is_named(tmp_path):
+    import h5py
+
+    corner = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    i = np.arange(32)
+    kept = np.add.outer(i, i) <= 32
+    texture = np.zeros((4, 13, 32, 32), np.float16)
+    texture[:, :6] = 0.25 * kept
+    texture[:, 6] = 0.5 * kept
+    texture[:, 7:10] = np.array([0.5, 0.5, 1])[:, None, None] * kept
+    texture[1, 0] = kept * (i / 64)  # red rises along the columns, towards corner 1
+    texture[1, 6] = kept * (i / 32)[:, None]  # rougher towards corner 2, from 0
+    texture[2, 0, 31, 31] = 7  # a cell that is not kept means nothing
+    arrays = {"triangles": np.stack([corner] * 4), "vn": np.broadcast_to(np.float32([0, 0, 1]), (4, 3, 3))}
+    arrays |= {"c2w": np.eye(4, dtype=np.float32)[None], "fov": np.float32([40]), "texture": texture}
+
+    def load(**changes):
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            file.update(arrays | changes)
+        return load_scene(tmp_path / "a.h5")
+
+    scene = load()
+    assert scene.patch_index.tolist() == [-1, 0, -1, -1] and scene.patches.shape == (1, 7, 32, 32)
+    assert np.array_equal(scene.patches[0, 0], texture[1, 0]) and (scene.patches[0, 1] == texture[1, 1]).all()
+    assert scene.patches[0, 6][kept].min() == np.float16(0.01) and scene.patches[0, 6, 20, 3] == np.float16(20 / 32)
+    inside = np.add.outer(i, i) < 32
+    assert scene.diffuse[1] == pytest.approx([texture[1, 0][inside].astype(float).mean(), 0.25, 0.25], abs=1e-6)
+    assert scene.diffuse[0].tolist() == scene.diffuse[2].tolist() == [0.25] * 3
+    for channel, name in ((8, "normal"), (11, "emission")):
+        wrong = texture.copy()
+        wrong[3, channel, 1, 1] += 0.25
+        with pytest.raises(UserError, match=f"{name} changes within triangle 3"):
+            load(texture=wrong)
+    with pytest.raises(UserError, match="16 x 16"):
+        load(texture=texture[:, :, :16, :16])
+    with pytest.raises(UserError, match="expected"):
+        load(texture=texture[:, :7])

@@ -92,7 +92,10 @@ def test_summary_tells_samples_errors_and_the_noise_floor(tmp_path, capsys):
     }
     picture = np.ones((8, 8, 3), np.float32)
     meta = {"index": 0, "spp": 16, "error": None}
-    image = encode_view(ViewRecord(picture[None], picture, picture, picture, picture[..., 0], picture[..., 0], meta))
+    nothing = np.full(picture.shape[:2], -1, np.int32)
+    image = encode_view(
+        ViewRecord(picture[None], picture, picture, picture, picture[..., 0], picture[..., 0], nothing, nothing, meta)
+    )
     records = []
     for id, views in metas.items():
         members = {f"view{told['index']}.exr": image for told in views if told["status"] == "ok"}
@@ -167,7 +170,8 @@ def test_noise_floor_is_the_known_noise_of_synthetic_pairs():
 
     def noisy():
         lights = truth + rng.normal(scale=0.01, size=truth.shape).astype(np.float32)
-        return ViewRecord(lights, blank, blank, blank, blank[..., 0], blank[..., 0])
+        nothing = np.full(blank.shape[:2], -1, np.int32)
+        return ViewRecord(lights, blank, blank, blank, blank[..., 0], blank[..., 0], nothing, nothing)
 
     a, b = noisy(), noisy()
     told = noise.pair_error(a, b, np.random.default_rng(7))
@@ -209,7 +213,8 @@ def made_up(id, *, variant="single", lights=2, side=16, statuses=("ok", "dark", 
         metas.append(meta)
         if status == "ok":
             colour = np.full((side, side, 3), 0.1 * (index + 1), np.float32)
-            view = ViewRecord(np.stack([colour] * lights), colour, colour, colour, flat, flat, meta)
+            found = np.arange(flat.size, dtype=np.int32).reshape(flat.shape) - 1
+            view = ViewRecord(np.stack([colour] * lights), colour, colour, colour, flat, flat, found, found, meta)
             members[f"view{index}.exr"] = encode_view(view)
     noted = {"template": template, "variant": variant, "lights": lights, "views": metas}
     return Record(id, {**members, "meta.json": pack_json(noted)})
