@@ -1,0 +1,691 @@
+"""Speed of path tracing at equal error: ours, Mitsuba's built-in ``path`` integrator, and Blender Cycles on the same arrays:
+
+    python bench/render.py [--cycles-python PYTHON] [--views 6] [--resolution 256] [--scenes PATH...]
+
+PYTHON has ``bpy`` (``python3.11 -m venv B && B/bin/pip install bpy==5.0.1``). Without ``--scenes`` (scene files, folders of
+them, or a scene artifact of a store) it makes a small scene artifact by the released law from procedural objects. Lights are
+hidden from cameras, as in the released data. About 25 minutes on 2 quiet cores; ``--views 2``, ``--resolution 128``,
+``--truth-spp 512`` and ``--patience 5`` cut that. Artifacts and truths are kept in ``--work`` for the next run.
+
+It prints, with the spread over views:
+1. samples per second of ours and of ``path``: the same scene, backend, depth, samples and box filter, lights hidden for both;
+2. time and samples to a target error, with and without denoising: where ``render_views(target_error=...)`` stops and which
+   error the view then really has; and which fixed number of samples, doubling from 16 and interpolated, first has it;
+3. fixed 64 and 4,096 samples (4,096 where it was not rendered: the time from the rate, the error without denoising from the
+   truth's noise by 1/sqrt(samples));
+4. views per hour, everything included (process start, imports, choosing a backend, compiling kernels with an empty cache,
+   reading the arrays, building the scene, denoising, writing the EXR), ours at ``--target`` against Cycles
+   (a) at the released settings: 4,096 samples, adaptive threshold 0.01, denoised, Blender's default light paths;
+   (b) tuned: unclamped and as deep as ours, denoised with guides, every view at the fewest samples, doubling from 16, that
+   have the error that ours really has; (b') the same interpolated to exactly that error. Nobody knows these numbers before
+   rendering: (b) is the best that Cycles could do, not what a data run would get.
+
+Error is the mean absolute difference of log10(1 + x) to the truth: a raw render by our own tracer, in two halves that share
+no path. Raw, because a denoised truth shares its bias with what it judges. The truth's noise adds to a measured error by its
+variance, to first order, so it is taken out by extrapolation: twice the error against the mean of the halves, less the
+mean error against each half. Where an error is not well above the printed noise, that is an upper bound.
+The same truth judges Cycles. The renderers agree to about 0.3 %, less than the targets, and a truth by Cycles would have to be
+as long to be as strict: several times our time. ``--cycles-truth-spp N`` gives it one nevertheless. The column "mean" (of
+values clamped at 4, over the truth's) shows how far an image is from the truth on the whole.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.keys import seed_for
+from pipeline.store import Artifact
+from stages.exr import encode_view, read_rgb
+from stages.metrics import log_error
+from stages.records import SceneRecord
+from stages.released import load_scene
+from stages.rendering import backend as backends
+from stages.rendering.render import render_views
+from stages.s04_render import Render
+
+ROOT = Path(__file__).resolve().parents[1]
+MAX_DEPTH = 34  # segments; Cycles: 32 bounces
+CHUNK = 256  # samples per pixel in one call for a truth
+RATE_SPP = 64  # samples per pixel of the renders that measure samples per second
+FIXED = (64, 4096)
+MADE = [  # overrides of the default scenes
+    "collect.per_family=1",
+    "decimate.budgets=[256,512,1024]",
+    "scene.count.train=24",
+    "scene.count.validation=0",
+    "scene.count.test=0",
+    "scene.max_triangles=1572",
+]
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Truth:
+    """Two long raw renders of a view that share no path; both halves together have ``spp`` samples per pixel."""
+
+    halves: np.ndarray  # (2, H, W, 3)
+    spp: int
+
+    @property
+    def image(self) -> np.ndarray:
+        return self.halves.mean(axis=0)
+
+    @property
+    def noise(self) -> float:
+        """Error of the mean of the halves, in expectation."""
+        return log_error(*self.halves) / 2
+
+    def error(self, image: np.ndarray) -> float:
+        """Of an independent image against a truth without noise, extrapolated linearly in the variance of the truth."""
+        whole = log_error(self.image, image)
+        return max(0.0, 2 * whole - np.mean([log_error(half, image) for half in self.halves]))
+
+
+@dataclass
+class Point:
+    """A render of a fixed number of samples."""
+
+    spp: int
+    seconds: float
+    error: float
+
+
+def crossing(points: Sequence[Point], error: float) -> Point | None:
+    """Where renders of more and more samples first have ``error``: between two by straight lines in logarithms, else the
+    first; None where the last does not have it."""
+    before = None
+    for point in points:
+        if point.error <= error:
+            if before is None or point.error <= 0:
+                return point
+            t = np.log(before.error / error) / np.log(before.error / point.error)
+
+            def between(a: float, b: float, t: float = t) -> float:
+                return float(a ** (1 - t) * b**t)
+
+            return Point(round(between(before.spp, point.spp)), between(before.seconds, point.seconds), error)
+        before = point
+    return None
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class View:
+    """A scene with one camera."""
+
+    name: str
+    scene: SceneRecord
+    arrays: Path  # its npz, which both renderers read
+
+
+def made_scenes(work: Path) -> list[SceneRecord]:
+    """A small scene artifact of the released law, by the project's own pipeline."""
+    command = [sys.executable, "-m", "pipeline", "stage=scene", f"store={work / 'store'}", *MADE]
+    done = subprocess.run(command, cwd=ROOT, env=environment(), capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"error: making the scenes failed: {done.stdout[-1000:]}{done.stderr[-1000:]}")
+    newest = max((work / "store" / "scene").glob("*/manifest.json"), key=lambda path: path.stat().st_mtime).parent
+    return artifact_scenes(newest)
+
+
+def artifact_scenes(path: Path) -> list[SceneRecord]:
+    artifact = Artifact(path)
+    return [SceneRecord.from_record(artifact.read(row.id)) for row in artifact.rows()]
+
+
+def read_scenes(paths: list[Path]) -> list[SceneRecord]:
+    """From scene artifacts, scene files, and folders of scene files."""
+    scenes = []
+    for path in paths:
+        if (path / "manifest.json").is_file():
+            scenes += artifact_scenes(path)
+        elif path.is_dir():
+            scenes += [load_scene(file) for file in sorted(path.iterdir()) if file.suffix.lower() in (".h5", ".hdf5", ".json")]
+        else:
+            scenes.append(load_scene(path))
+    return scenes
+
+
+def choose_views(scenes: list[SceneRecord], count: int, folder: Path, backend: dict, threads: int) -> list[View]:
+    """``count`` views that the render stage would keep, of as many different scenes as there are."""
+    stride = max(1, len(scenes) // count)
+    order = [scene for first in range(stride) for scene in scenes[first::stride]]
+    views: list[View] = []
+    for camera in range(max((len(scene.fov_deg) for scene in order), default=0)):
+        for scene in order:
+            if len(views) == count or camera >= len(scene.fov_deg):
+                continue
+            one = replace(scene, camera_to_world=scene.camera_to_world[[camera]], fov_deg=scene.fov_deg[[camera]])
+            probe = render_views(one, 64, max_spp=16, seed=0, backend=backend, denoise=False, threads=threads)[0]
+            if probe.meta["status"] == "ok":
+                name = f"{len(views)}-{scene.id}-{camera}"
+                np.savez(folder / f"{name}.npz", **one.arrays())
+                views.append(View(name, one, folder / f"{name}.npz"))
+    if not views:
+        sys.exit("error: no view left to render: give --scenes whose cameras see something")
+    return views
+
+
+def read_arrays(path: Path) -> SceneRecord:
+    with np.load(path) as file:
+        return SceneRecord(path.stem, **{name: file[name] for name in file.files})
+
+
+# --- what is measured in this process ---------------------------------------------------------------------------------
+
+
+class Bench:
+    """Renders views and keeps the time. Nothing here includes start-up."""
+
+    def __init__(self, arguments: argparse.Namespace, backend: dict[str, Any]):
+        self.arguments, self.backend = arguments, backend
+        self.pixels = arguments.resolution**2
+
+    def render(self, view: View, what: str, spp: int, **named: Any) -> tuple[float, Any]:
+        """(seconds, view record); ``what`` decides the random numbers."""
+        began = time.perf_counter()
+        record = render_views(
+            view.scene,
+            self.arguments.resolution,
+            max_spp=spp,
+            seed=seed_for(self.arguments.seed, f"bench/{what}", view.name),
+            backend=self.backend,
+            max_depth=MAX_DEPTH,
+            threads=self.arguments.threads,
+            **named,
+        )[0]
+        return time.perf_counter() - began, record
+
+    def truth(self, view: View) -> Truth:
+        spp = max(1, self.arguments.truth_spp // 2)
+
+        def make() -> np.ndarray:
+            halves = np.zeros((2, self.arguments.resolution, self.arguments.resolution, 3))
+            for half in range(2):
+                for first in range(0, spp, CHUNK):
+                    share = min(CHUNK, spp - first)
+                    record = self.render(view, f"truth/{half}/{first}", share, denoise=False)[1]
+                    halves[half] += record.image.astype(np.float64) * (share / spp)
+            return halves
+
+        return Truth(self.cached(view, ["ours", Render.version, MAX_DEPTH, 2 * spp], make), 2 * spp)
+
+    def cached(self, view: View, what: list, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """``make()`` (2, H, W, 3), float32, kept between runs under the hash of all that decides it."""
+        digest = hashlib.sha256(json.dumps([*what, view.name, self.arguments.resolution, self.arguments.seed]).encode())
+        for name, values in view.scene.arrays().items():
+            digest.update(name.encode() + np.ascontiguousarray(values).tobytes())
+        path = self.arguments.work / "truth" / f"{digest.hexdigest()[:24]}.npy"
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = path.with_suffix(".tmp.npy")
+            np.save(temporary, make().astype(np.float32))
+            temporary.replace(path)
+        return np.load(path)
+
+    def rates(self, view: View, repeats: int = 2) -> dict[str, float]:
+        """Samples per second, the best of ``repeats``, of our integrator and of the built-in one; the ratio of their means."""
+        ours, image = min((self.render(view, "rate", RATE_SPP, denoise=False) for _ in range(repeats)), key=lambda r: r[0])
+        path = BuiltIn(view.scene, self.arguments.resolution)
+        theirs, built_in = min((path.render(RATE_SPP, seed) for seed in range(repeats + 1)), key=lambda r: r[0])
+        samples = self.pixels * RATE_SPP
+        mean = float(np.minimum(image.image, 4).mean() / np.minimum(built_in, 4).mean())
+        return {"ours": samples / ours, "path": samples / theirs, "mean": mean}
+
+    def doubling(self, view: View, truth: Truth, denoise: bool) -> list[Point]:
+        """Fixed sample counts from 16 on, until the smallest target or the patience is reached.
+
+        Without denoising, images of independent samples are averaged, so that only the last count is paid for.
+        """
+        points: list[Point] = []
+        spp, total, seconds = 16, None, 0.0
+        while True:
+            if denoise:
+                took, record = self.render(view, f"fixed/{spp}", spp, denoise=True)
+                image = record.image
+            else:
+                share = spp if total is None else spp // 2
+                took, record = self.render(view, f"raw/{spp}", share, denoise=False)
+                total = record.image if total is None else (total + record.image) / 2
+                seconds += took
+                took, image = seconds, total
+            points.append(Point(spp, took, truth.error(image)))
+            enough = points[-1].error <= min(self.arguments.targets) and spp >= RATE_SPP
+            if enough or spp >= self.arguments.max_spp or 2 * took > self.arguments.patience:
+                return points
+            spp *= 2
+
+    def stops(self, view: View, truth: Truth, denoise: bool, rate: float) -> dict[float, dict]:
+        """target -> where ``render_views`` stops on its own, at the latest when the patience (at ``rate`` samples per second)
+        is over; smaller targets that would take longer are left out."""
+        found: dict[float, dict] = {}
+        took, patient = 0.0, self.arguments.patience * rate / self.pixels
+        most = min(self.arguments.max_spp, 16 * 2 ** max(0, int(np.log2(patient / 16))))
+        for target in sorted(self.arguments.targets, reverse=True):
+            if 4 * took > self.arguments.patience:  # half the error takes four times the samples
+                break
+            took, record = self.render(view, "stop", most, denoise=denoise, target_error=target)
+            found[target] = {
+                "spp": record.meta["spp"],
+                "seconds": took,
+                "estimate": record.meta["error"],
+                "error": truth.error(record.image),
+            }
+        return found
+
+
+class BuiltIn:
+    """Mitsuba's ``path`` integrator in the variant that ours runs in, on the same meshes and materials.
+
+    Its area emitters shine from one side, so each light is two of them, as in ``stages.rendering.scalar``.
+    """
+
+    def __init__(self, scene: SceneRecord, resolution: int):
+        import mitsuba as mi
+
+        from stages.rendering.scalar import ScalarRenderer
+
+        built = ScalarRenderer(scene, lights_visible=False)
+        built._switch_on(range(scene.n_lights))
+        self.scene, self.sensor = built.scene, built._sensor(0, resolution)
+        self.integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
+
+    def render(self, spp: int, seed: int) -> tuple[float, np.ndarray]:
+        """(seconds, (H, W, 3) image)"""
+        import mitsuba as mi
+
+        began = time.perf_counter()
+        image = np.array(mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=spp, seed=seed))
+        return time.perf_counter() - began, image[..., :3]
+
+
+def warm_up(scene: SceneRecord, backend: dict[str, Any], threads: int) -> None:
+    """Compile the kernels, which counts as start-up."""
+    render_views(scene, 8, max_spp=32, target_error=1e-9, seed=0, backend=backend, max_depth=MAX_DEPTH, threads=threads)
+
+
+# --- whole processes --------------------------------------------------------------------------------------------------
+
+
+def environment(**more: str) -> dict[str, str]:
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return {**os.environ, "PYTHONPATH": path, **more}
+
+
+def produce(job: dict[str, Any]) -> dict[str, Any]:
+    """In a process of its own: every view to the target error, as the render stage makes it. Seconds from choosing a
+    backend on."""
+    began = time.perf_counter()
+    backend = backends.choose(job["backend"])
+    warm_up(read_arrays(Path(job["arrays"][0])), backend, job["threads"])
+    rows = []
+    for path in map(Path, job["arrays"]):
+        start = time.perf_counter()
+        record = render_views(
+            read_arrays(path),
+            job["resolution"],
+            max_spp=job["max_spp"],
+            seed=seed_for(job["seed"], "bench/produce", path.stem),
+            backend=backend,
+            target_error=job["target"],
+            max_depth=MAX_DEPTH,
+            threads=job["threads"],
+        )[0]
+        (Path(job["out"]) / f"{path.stem}.exr").write_bytes(encode_view(record))
+        rows.append({"seconds": time.perf_counter() - start, "spp": record.meta["spp"], "estimate": record.meta["error"]})
+    return {"seconds": time.perf_counter() - began, "views": rows}
+
+
+def run(command: list[str], **more: str) -> tuple[float, dict[str, Any]]:
+    """(seconds from start to exit, the JSON on the last line that holds some)."""
+    began = time.perf_counter()
+    done = subprocess.run(command, capture_output=True, text=True, env=environment(**more))
+    seconds = time.perf_counter() - began
+    answers = [line for line in done.stdout.splitlines() if line.startswith("{")]
+    if done.returncode or not answers:
+        sys.exit(f"error: {' '.join(command[:3])} .. failed ({done.returncode}): {done.stdout[-1000:]}{done.stderr[-2000:]}")
+    return seconds, json.loads(answers[-1])
+
+
+@dataclass
+class Production:
+    """All views by one process, from its start to its exit."""
+
+    seconds: float
+    each: list[float]  # per view, start-up excluded
+    errors: list[float]
+    spp: list[int | None]
+    means: list[float]  # over the truth's, values clamped at 4
+
+    @property
+    def per_hour(self) -> float:
+        return 3600 * len(self.each) / self.seconds
+
+
+def judged(images: list[np.ndarray], truths: list[Truth]) -> dict[str, list[float]]:
+    pairs = list(zip(images, truths, strict=True))
+    means = [float(np.minimum(image, 4).mean() / np.minimum(truth.image, 4).mean()) for image, truth in pairs]
+    return {"errors": [truth.error(image) for image, truth in pairs], "means": means}
+
+
+def ours(arguments: argparse.Namespace, backend: dict, views: list[View], truths: list[Truth]) -> Production:
+    with tempfile.TemporaryDirectory() as folder:
+        names = ("resolution", "max_spp", "seed", "target", "threads")
+        job = {name: getattr(arguments, name) for name in names} | {"backend": backend["backend"], "out": folder}
+        job["arrays"] = [str(view.arrays) for view in views]
+        cache = Path(folder) / "kernels"
+        cache.mkdir()
+        # an empty kernel cache: a fresh machine compiles
+        seconds, told = run(
+            [sys.executable, str(Path(__file__).resolve()), "--produce", json.dumps(job)], DRJIT_CACHE_DIR=str(cache)
+        )
+        images = [read_rgb(Path(folder) / f"{view.name}.exr") for view in views]
+    rows = told["views"]
+    return Production(seconds, [row["seconds"] for row in rows], spp=[row["spp"] for row in rows], **judged(images, truths))
+
+
+class Cycles:
+    """``bench/cycles.py`` in an interpreter that has Blender."""
+
+    def __init__(self, arguments: argparse.Namespace, gpu: bool):
+        self.arguments, self.gpu, self.version = arguments, gpu, ""
+
+    def images(self, views: list[View], spp: list[int], *options: str) -> tuple[float, list[float], list[np.ndarray]]:
+        """(seconds of the process, seconds per view of export and render, images)."""
+        with tempfile.TemporaryDirectory() as folder:
+            command = [self.arguments.cycles_python, str(ROOT / "bench" / "cycles.py"), *(str(view.arrays) for view in views)]
+            command += ["--out", folder, "--resolution", str(self.arguments.resolution), "--spp", *map(str, spp)]
+            command += ["--threads", str(self.arguments.threads), *(["--gpu"] if self.gpu else []), *options]
+            seconds, told = run(command)
+            self.version = told["blender"]
+            images = [read_rgb(Path(folder) / f"{view.name}-0.exr") for view in views]
+        return seconds, [row["export"] + sum(row["renders"]) for row in told["scenes"]], images
+
+    def production(self, views: list[View], truths: list[Truth], spp: list[int], *options: str) -> Production:
+        seconds, each, images = self.images(views, spp, "--seed", "1", "--denoise", *options)
+        return Production(seconds, each, spp=list(spp), **judged(images, truths))
+
+    def doubling(self, views: list[View], truths: list[Truth], errors: list[float]) -> list[list[Point]]:
+        """Per view: fixed sample counts from 16 on, denoised, until it has its error of ``errors`` or the most samples."""
+        points: list[list[Point]] = [[] for _ in views]
+        left, spp = list(range(len(views))), 16
+        while left and spp <= self.arguments.cycles_spp:
+            done = self.production([views[i] for i in left], [truths[i] for i in left], [spp] * len(left))
+            for i, seconds, error in zip(left, done.each, done.errors, strict=True):
+                points[i].append(Point(spp, seconds, error))
+            patient = [i for i in left if 2 * points[i][-1].seconds <= self.arguments.patience]
+            left = [i for i in patient if points[i][-1].error > errors[i]]
+            spp *= 2
+        return points
+
+    def truths(self, bench: Bench, views: list[View]) -> list[Truth]:
+        """Its own: two halves with other random numbers."""
+        spp = max(1, self.arguments.cycles_truth_spp // 2)
+        found = []
+        for view in views:
+
+            def make(view: View = view) -> np.ndarray:
+                return np.stack([self.images([view], [spp], "--seed", seed)[2][0] for seed in ("1001", "1002")])
+
+            found.append(Truth(bench.cached(view, ["cycles", self.version, 2 * spp], make), 2 * spp))
+        return found
+
+
+def progress(text: str) -> None:
+    print(f"[{time.strftime('%H:%M:%S')}] {text}", file=sys.stderr, flush=True)
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def table(titles: list[str], rows: list[list[str]]) -> None:
+    """A Markdown table, numbers to the right."""
+    print("\n| " + " | ".join(titles) + " |")
+    print("| --- | " + " | ".join("---:" for _ in titles[1:]) + " |")
+    for row in rows:
+        print("| " + " | ".join(row) + " |")
+    sys.stdout.flush()
+
+
+def spread(values: Sequence[float], form: str) -> str:
+    """Median (least to most)."""
+    return f"{format(float(np.median(values)), form)} ({format(min(values), form)} to {format(max(values), form)})"
+
+
+def print_views(views: list[View], truths: list[Truth]) -> None:
+    rows = []
+    for view, truth in zip(views, truths, strict=True):
+        meta = view.scene.meta
+        kind = f"{meta.get('template', '')} {meta.get('variant', '')}".strip()
+        row = [view.name, kind, f"{len(view.scene.triangles):,}", str(view.scene.n_lights)]
+        rows.append([*row, f"{truth.image.mean():.3f}", f"{truth.noise:.5f}"])
+    table(["view", "kind", "triangles", "lights", "mean radiance", "noise of the truth"], rows)
+    print(f"Truth: {truths[0].spp:,} samples per pixel, raw, in two halves; its noise is taken out of the errors below.")
+
+
+def print_rates(views: list[View], rates: list[dict[str, float]]) -> None:
+    rows = []
+    for view, rate in zip(views, rates, strict=True):
+        row = [view.name, *(f"{rate[name] / 1e6:.2f}" for name in ("ours", "path"))]
+        rows.append([*row, f"{rate['path'] / rate['ours']:.2f}", f"{rate['mean'] - 1:+.2%}"])
+    total = {name: len(rates) / sum(1 / rate[name] for rate in rates) for name in ("ours", "path")}  # same samples each
+    rows.append(["ALL", *(f"{total[name] / 1e6:.2f}" for name in total), f"{total['path'] / total['ours']:.2f}", ""])
+    table(["view", "ours, M samples/s", "`path`, M samples/s", "`path` over ours", "mean, ours over `path`"], rows)
+
+
+def print_targets(views: list[View], denoise: bool, sweeps: list[list[Point]], stops: list[dict], targets: list[float]) -> None:
+    rows = []
+    for target in targets:
+        reached = []
+        for view, points, stop in zip(views, sweeps, stops, strict=True):
+            row = [f"{target:g}", view.name]
+            if target in stop:
+                spp, seconds, estimate, error = (stop[target][name] for name in ("spp", "seconds", "estimate", "error"))
+                row += [f"{'' if estimate <= target else 'over '}{spp:,}", f"{seconds:.2f}", f"{estimate:.5f}", f"{error:.5f}"]
+                reached += [(spp, seconds, estimate, error)] if estimate <= target else []
+            else:
+                row += ["-"] * 4
+            point = crossing(points, target)
+            rows.append([*row, *([f"{point.spp:,}", f"{point.seconds:.2f}"] if point else [f"over {points[-1].spp:,}", "-"])])
+        if reached:
+            spp, seconds, estimate, error = np.mean(reached, axis=0)
+            row = [f"{target:g}", f"MEAN OF {len(reached)}", f"{spp:,.0f}", f"{seconds:.2f}", f"{estimate:.5f}", f"{error:.5f}"]
+            rows.append([*row, "", ""])
+    print(f"\nTo a target error, {'denoised' if denoise else 'not denoised'}:")
+    table(["target", "view", "stops at samples", "s", "estimate", "true error", "has it at samples", "s"], rows)
+
+
+def print_fixed(
+    views: list[View], truths: list[Truth], rates: list[dict], sweeps: dict[bool, list[list[Point]]], pixels: int
+) -> None:
+    rows = []
+    for index, view in enumerate(views):
+        row = [view.name]
+        for spp in FIXED:
+            for denoise in (False, True):
+                points = {point.spp: point for point in sweeps[denoise][index]}
+                if spp in points:
+                    row += [f"{points[spp].seconds:.2f}", f"{points[spp].error:.5f}"]
+                    continue
+                seconds = spp * pixels / rates[index]["ours"]
+                if denoise:  # what denoising costs does not depend on the samples
+                    first = sweeps[True][index][0]
+                    seconds += max(0.0, first.seconds - first.spp * pixels / rates[index]["ours"])
+                error = f"~{truths[index].noise * np.sqrt(truths[index].spp / spp):.5f}" if not denoise else "-"
+                row += [f"~{seconds:.1f}", error]
+        rows.append(row)
+    print("\nFixed samples (~: not rendered; from the rate, and from the truth's noise):")
+    table(["view", *(f"{spp:,}{kind}: {what}" for spp in FIXED for kind in ("", " denoised") for what in ("s", "error"))], rows)
+
+
+def print_productions(views: list[View], productions: dict[str, Production]) -> None:
+    """The first one is ours; every other is compared with it."""
+    first = next(iter(productions.values()))
+    titles, rows = ["view"], [[view.name] for view in views]
+    for name, production in productions.items():
+        other = production is not first
+        titles += [f"{name}: samples", "s", "error", "mean", *(["s over ours"] if other else [])]
+        for index, row in enumerate(rows):
+            spp, seconds = production.spp[index], production.each[index]
+            row += ["adaptive" if spp is None else f"{spp:,}", f"{seconds:.2f}", f"{production.errors[index]:.5f}"]
+            row += [f"{production.means[index] - 1:+.2%}", *([f"{seconds / first.each[index]:.2f}"] if other else [])]
+    table(titles, rows)
+    rows = []
+    for name, production in productions.items():
+        ratios = [a / b for a, b in zip(production.each, first.each, strict=True)]
+        row = [
+            name,
+            f"{production.seconds:.1f}",
+            f"{production.seconds - sum(production.each):.1f}",
+            f"{production.per_hour:,.0f}",
+        ]
+        row += [f"{first.per_hour / production.per_hour:.2f}", spread(production.each, ".2f"), spread(ratios, ".2f")]
+        rows.append([*row, spread(production.errors, ".5f")])
+    titles = ["all views in one process", "s", "of them start-up", "views per hour", "ours over it"]
+    table([*titles, "s per view: median (range)", "over ours: median (range)", "true error: median (range)"], rows)
+
+
+def print_machine(arguments: argparse.Namespace, backend: dict[str, Any]) -> None:
+    info = Path("/proc/cpuinfo")
+    models = [line for line in info.read_text().splitlines() if line.startswith("model name")] if info.exists() else []
+    model = models[0].split(":")[1].strip() if models else platform.machine()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("mitsuba", "drjit", "pyoidn", "numpy"))
+    print(f"{model}, {cores} cores, {arguments.threads} threads for each renderer; load when it began {os.getloadavg()[0]:.2f}")
+    print(f"backend {backend}; Python {platform.python_version()}, {versions}")
+    print(f"{arguments.resolution} x {arguments.resolution} pixels, seed {arguments.seed}", flush=True)
+
+
+def compare_with_cycles(
+    arguments: argparse.Namespace, cycles: Cycles, bench: Bench, views: list[View], truths: list[Truth], mine: Production
+) -> None:
+    if arguments.cycles_truth_spp:
+        progress("truths by Cycles")
+        truths = cycles.truths(bench, views)
+        print(f"\nTruths by Cycles for Cycles: noise {spread([truth.noise for truth in truths], '.5f')}")
+    progress("Cycles at the released settings")
+    most = [arguments.cycles_spp] * len(views)
+    released = cycles.production(views, truths, most, "--mode", "released", "--adaptive", "0.01")
+    released.spp = [None] * len(views)
+    progress("Cycles, denoised, doubling the samples")
+    points = cycles.doubling(views, truths, mine.errors)
+    reached = [crossing(p, error) for p, error in zip(points, mine.errors, strict=True)]
+    progress("Cycles, tuned")
+    tuned = cycles.production(views, truths, [p[-1].spp for p in points])
+    even = replace(tuned, each=[(at or p[-1]).seconds for at, p in zip(reached, points, strict=True)])
+    even.spp = [(at or p[-1]).spp for at, p in zip(reached, points, strict=True)]
+    even.errors = [(at or p[-1]).error for at, p in zip(reached, points, strict=True)]
+    even.seconds = tuned.seconds - sum(tuned.each) + sum(even.each)
+    print(f"\nAt target error {arguments.target:g}, start-up included, beside Blender {cycles.version}:")
+    print_productions(views, {"ours": mine, "(a)": released, "(b)": tuned, "(b')": even})
+    print("The error of (a) holds what its clamps and its wider pixel filter change on purpose.")
+    if None in reached:
+        print(f"(b) never had our error in {reached.count(None)} views: there it counts at its last, which favours it.")
+
+
+def positive(kind: type) -> Callable[[str], Any]:
+    def parse(text: str) -> Any:
+        value = kind(text)
+        if not value > 0:
+            raise ValueError(text)
+        return value
+
+    parse.__name__ = f"positive {kind.__name__}"
+    return parse
+
+
+def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    whole, number = positive(int), positive(float)
+    parser.add_argument("--cycles-python", metavar="PYTHON", help="an interpreter that has bpy; default: no Cycles")
+    parser.add_argument("--scenes", nargs="+", type=Path, metavar="PATH", help="default: made by the released law")
+    parser.add_argument("--views", type=whole, default=6, help="default %(default)s")
+    parser.add_argument("--resolution", type=whole, default=256, help="default %(default)s")
+    parser.add_argument("--target", type=number, default=0.002, help="of the views per hour, default %(default)s")
+    parser.add_argument("--targets", default="0.004,0.002,0.001", help="of the table, default %(default)s")
+    parser.add_argument("--max-spp", type=whole, default=4096, help="of our renders, default %(default)s")
+    parser.add_argument("--truth-spp", type=whole, default=2048, help="default %(default)s")
+    parser.add_argument("--cycles-spp", type=whole, default=4096, help="of Cycles, at most, default %(default)s")
+    parser.add_argument("--cycles-truth-spp", type=int, default=0, metavar="N", help="a truth of its own for Cycles; 0: ours")
+    parser.add_argument(
+        "--patience", type=number, default=20.0, metavar="S", help="a longer render is left out; default %(default)s"
+    )
+    parser.add_argument("--backend", choices=backends.CHOICES, default="auto")
+    parser.add_argument("--threads", type=whole, default=os.cpu_count(), help="for each renderer, default all (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--work", type=Path, default=ROOT / "runs" / "bench", help="kept between runs, default runs/bench")
+    arguments = parser.parse_args(words)
+    try:
+        arguments.targets = [number(text) for text in arguments.targets.split(",")]
+    except ValueError:
+        parser.error(f"--targets {arguments.targets}: expected errors with commas between")
+    if arguments.cycles_python and not shutil.which(arguments.cycles_python):
+        parser.error(f"--cycles-python {arguments.cycles_python} cannot be run")
+    arguments.work = arguments.work.resolve()
+    return arguments
+
+
+def main() -> None:
+    arguments = parsed()
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    backend = backends.choose(arguments.backend)
+    print_machine(arguments, backend)
+    bench = Bench(arguments, backend)
+    with tempfile.TemporaryDirectory() as folder:
+        progress("scenes")
+        scenes = read_scenes(arguments.scenes) if arguments.scenes else made_scenes(arguments.work)
+        views = choose_views(scenes, arguments.views, Path(folder), backend, arguments.threads)
+        cycles = Cycles(arguments, backend["backend"] == "cuda") if arguments.cycles_python else None
+        if cycles:
+            cycles.images(views[:1], [1], "--resolution", "8", "--denoise")  # fails now rather than at the end
+        truths, rates = [], []
+        sweeps: dict[bool, list[list[Point]]] = {False: [], True: []}
+        stops: dict[bool, list[dict]] = {False: [], True: []}
+        for view in views:
+            progress(f"{view.name}: truth")
+            truths.append(bench.truth(view))
+            progress(f"{view.name}: samples per second")
+            rates.append(bench.rates(view))
+            for denoise in (True, False):
+                progress(f"{view.name}: {'denoised' if denoise else 'not denoised'}")
+                sweeps[denoise].append(bench.doubling(view, truths[-1], denoise))
+                stops[denoise].append(bench.stops(view, truths[-1], denoise, rates[-1]["ours"]))
+        print_views(views, truths)
+        print_rates(views, rates)
+        for denoise in (True, False):
+            print_targets(views, denoise, sweeps[denoise], stops[denoise], arguments.targets)
+        print_fixed(views, truths, rates, sweeps, bench.pixels)
+        progress("ours in a process of its own")
+        mine = ours(arguments, backend, views, truths)
+        if cycles:
+            compare_with_cycles(arguments, cycles, bench, views, truths, mine)
+        else:
+            print(f"\nAt target error {arguments.target:g}, start-up included (give --cycles-python to compare with Cycles):")
+            print_productions(views, {"ours": mine})
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--produce"]:
+        print("\n" + json.dumps(produce(json.loads(sys.argv[2]))), flush=True)
+    else:
+        main()
