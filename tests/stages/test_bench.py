@@ -25,11 +25,13 @@ def test_noise_of_the_truth_is_taken_out_of_an_error(bench, share):
     rng = np.random.default_rng(0)
     clean = rng.uniform(0.5, 1.5, (128, 128, 3))
     image = clean + rng.normal(0, 0.01, clean.shape)
-    noisy = bench.Truth(clean + rng.normal(0, 0.01 * (2 * share) ** 0.5, (2, *clean.shape)), 64)  # of the mean: share 0.01^2
+    halves = clean + rng.normal(0, 0.01 * (2 * share) ** 0.5, (2, *clean.shape))  # variance of their mean: share 0.01^2
+    truth = bench.Truth(64, halves, halves, clean)
     exact = bench.log_error(clean, image)
-    assert bench.log_error(noisy.image, image) > (1 + 0.4 * share) * exact
-    assert noisy.error(image) == pytest.approx(exact, rel=0.11 * share + 0.01)
-    assert noisy.noise == pytest.approx(bench.log_error(clean, noisy.image), rel=0.03)
+    assert bench.log_error(halves.mean(axis=0), image) > (1 + 0.4 * share) * exact
+    assert truth.bound(image) == pytest.approx(exact, rel=0.11 * share + 0.01)
+    assert truth.error(image) == pytest.approx(exact, rel=0.01)
+    assert truth.raw_noise == pytest.approx(bench.log_error(clean, halves.mean(axis=0)), rel=0.03)
 
 
 def test_crossing_is_interpolated_between_doublings(bench):
@@ -43,7 +45,9 @@ def test_crossing_is_interpolated_between_doublings(bench):
 
 
 def test_views_per_hour_count_the_start_up(bench):
-    production = bench.Production(seconds=30.0, each=[4.0, 6.0], errors=[0.001, 0.002], spp=[16, 32], means=[1.0, 1.0])
+    production = bench.Production(
+        seconds=30.0, each=[4.0, 6.0], errors=[0.001, 0.002], bounds=[0.001, 0.002], spp=[16, 32], means=[1.0, 1.0]
+    )
     assert production.per_hour == pytest.approx(240)
 
 
