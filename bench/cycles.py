@@ -1,11 +1,11 @@
 """Blender Cycles on a scene's arrays, inside an interpreter that has ``bpy`` (Blender 5 as a module, Python 3.11):
 
-    PYTHON bench/cycles.py SCENE.npz... --out FOLDER [--spp 64] [--adaptive 0.01] [--denoise] [--mode physical|released]
+    PYTHON bench/cycles.py SCENE.npz... [--out FOLDER] [--spp 64] [--adaptive 0.01] [--denoise] [--mode physical|released]
 
 Imports nothing of lightmill. Reads ``triangles`` (F, 3, 3), ``vertex_normals`` (F, 3, 3), ``diffuse``, ``specular``,
-``emission`` (F, 3), ``roughness`` (F,), ``camera_to_world`` (V, 4, 4) and ``fov_deg`` (V,), with the meaning of
-``stages.records.SceneRecord``; writes ``FOLDER/<name>-<view>.exr`` (float32, linear) and prints one line of JSON: seconds of
-export per scene and of each render.
+``emission`` (F, 3), ``roughness``, ``light_index`` (F,), ``camera_to_world`` (V, 4, 4) and ``fov_deg`` (V,), with the meaning
+of ``stages.records.SceneRecord``; writes ``FOLDER/<name>-<view>.exr`` (float32, linear) and prints one line of JSON: seconds
+of export per scene and of each render.
 
 One design choice: all surface triangles are one mesh whose material reads face attributes, so that thousands of materials
 cost nothing; lights are a second mesh (camera rays may pass through it) with a constant material per distinct radiance,
@@ -63,7 +63,7 @@ def shader(name: str) -> tuple[bpy.types.Material, bpy.types.NodeTree, bpy.types
 
 def add_surface(data: dict[str, np.ndarray], distribution: str) -> None:
     """diffuse / pi + specular * GGX, per triangle."""
-    chosen = ~data["emission"].any(axis=1)
+    chosen = data["light_index"] < 0
     mesh = add_mesh("surface", data["triangles"][chosen], data["vertex_normals"][chosen]).data
     material, tree, output = shader("surface")
     diffuse, glossy = tree.nodes.new("ShaderNodeBsdfDiffuse"), tree.nodes.new("ShaderNodeBsdfAnisotropic")
@@ -86,7 +86,7 @@ def add_surface(data: dict[str, np.ndarray], distribution: str) -> None:
 
 def add_lights(data: dict[str, np.ndarray], visible: bool) -> None:
     """Triangles that emit from both sides and reflect nothing."""
-    chosen = data["emission"].any(axis=1)
+    chosen = data["light_index"] >= 0
     if not chosen.any():
         return
     thing = add_mesh("lights", data["triangles"][chosen], data["vertex_normals"][chosen])
@@ -95,7 +95,7 @@ def add_lights(data: dict[str, np.ndarray], visible: bool) -> None:
     for index, radiance in enumerate(radiances.tolist()):
         material, tree, output = shader(f"light{index}")
         emission = tree.nodes.new("ShaderNodeEmission")
-        emission.inputs["Color"].default_value = (*(value / max(radiance) for value in radiance), 1)
+        emission.inputs["Color"].default_value = (*(value / (max(radiance) or 1) for value in radiance), 1)
         emission.inputs["Strength"].default_value = max(radiance)
         tree.links.new(emission.outputs[0], output.inputs["Surface"])
         material.cycles.emission_sampling = "FRONT_BACK"
@@ -113,7 +113,7 @@ def add_camera(camera_to_world: np.ndarray, fov_deg: float) -> bpy.types.Object:
     return camera
 
 
-def settings(arguments: argparse.Namespace, spp: int) -> None:
+def settings(arguments: argparse.Namespace) -> None:
     """All that is not geometry; what is not named here is as Blender's factory has it."""
     scene = bpy.context.scene
     scene.world = None  # black
@@ -125,7 +125,7 @@ def settings(arguments: argparse.Namespace, spp: int) -> None:
         scene.render.threads_mode, scene.render.threads = "FIXED", arguments.threads
     cycles = scene.cycles
     cycles.device = "GPU" if arguments.gpu else "CPU"
-    cycles.samples, cycles.seed = spp, arguments.seed
+    cycles.samples, cycles.seed = arguments.spp, arguments.seed
     cycles.use_adaptive_sampling = arguments.adaptive > 0
     cycles.adaptive_threshold, cycles.adaptive_min_samples = arguments.adaptive or 0.01, 0
     cycles.use_denoising, cycles.denoiser = arguments.denoise, "OPENIMAGEDENOISE"
@@ -150,16 +150,10 @@ def use_gpu() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE.npz")
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("scenes", nargs="*", type=Path, metavar="SCENE.npz", help="none: only say which Blender this is")
+    parser.add_argument("--out", type=Path, default=Path(), metavar="FOLDER", help="default: here")
     parser.add_argument("--resolution", type=int, default=256)
-    parser.add_argument(
-        "--spp",
-        type=int,
-        nargs="+",
-        default=[64],
-        help="samples per pixel, with --adaptive at most; one for all, or one per scene",
-    )
+    parser.add_argument("--spp", type=int, default=64, help="samples per pixel, with --adaptive at most")
     parser.add_argument("--adaptive", type=float, default=0.0, help="noise threshold of adaptive sampling; 0: off")
     parser.add_argument("--denoise", action="store_true", help="Open Image Denoise with albedo and normal")
     parser.add_argument("--mode", choices=tuple(BOUNCES), default="physical")
@@ -168,21 +162,18 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     parser.add_argument("--gpu", action="store_true")
     arguments = parser.parse_args()
-    if len(arguments.spp) not in (1, len(arguments.scenes)):
-        parser.error(f"--spp has {len(arguments.spp)} numbers: expected 1, or {len(arguments.scenes)} as there are scenes")
-    samples = arguments.spp * (len(arguments.scenes) if len(arguments.spp) == 1 else 1)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     if arguments.gpu:
         use_gpu()
     told = {"blender": bpy.app.version_string, "threads": arguments.threads or os.cpu_count(), "scenes": []}
-    for path, spp in zip(arguments.scenes, samples, strict=True):
+    for path in arguments.scenes:
         began = time.perf_counter()
         with np.load(path) as file:
             data = dict(file)
         if "patches" in data:
             parser.error(f"{path} has textured triangles, which are not handed to Cycles")
         bpy.data.batch_remove([*bpy.data.objects, *bpy.data.meshes, *bpy.data.materials, *bpy.data.cameras])
-        settings(arguments, spp)
+        settings(arguments)
         add_surface(data, "GGX" if arguments.mode == "physical" else "MULTI_GGX")
         add_lights(data, arguments.lights_visible)
         row = {"name": path.stem, "export": time.perf_counter() - began, "renders": []}

@@ -407,28 +407,35 @@ def run(command: list[str], **more: str) -> tuple[float, dict[str, Any]]:
 
 
 @dataclass
-class Production:
-    """All views by one process, from its start to its exit."""
+class Image:
+    """A view as a process rendered it; start-up excluded."""
 
+    samples: str
     seconds: float
-    each: list[float]  # per view, start-up excluded
-    errors: list[float]
-    bounds: list[float]
-    spp: list[int | None]
-    means: list[float]  # over the truth's, values clamped at 4
+    error: float
+    bound: float
+    mean: float  # over the truth's, of values clamped at 4
+
+
+@dataclass
+class Production:
+    """All views by one process."""
+
+    start_up: float  # seconds that belong to no view
+    images: list[Image]
+
+    @property
+    def seconds(self) -> float:
+        return self.start_up + sum(image.seconds for image in self.images)
 
     @property
     def per_hour(self) -> float:
-        return 3600 * len(self.each) / self.seconds
+        return 3600 * len(self.images) / self.seconds
 
 
-def judged(images: list[np.ndarray], truths: list[Truth]) -> dict[str, list[float]]:
-    pairs = list(zip(images, truths, strict=True))
-    return {
-        "errors": [truth.error(image) for image, truth in pairs],
-        "bounds": [truth.bound(image) for image, truth in pairs],
-        "means": [float(np.minimum(image, 4).mean() / np.minimum(truth.halves, 4).mean()) for image, truth in pairs],
-    }
+def judged(image: np.ndarray, truth: Truth, seconds: float, samples: str) -> Image:
+    mean = float(np.minimum(image, 4).mean() / np.minimum(truth.halves, 4).mean())
+    return Image(samples, seconds, truth.error(image), truth.bound(image), mean)
 
 
 def ours(arguments: argparse.Namespace, backend: dict, views: list[View], truths: list[Truth]) -> Production:
@@ -443,8 +450,9 @@ def ours(arguments: argparse.Namespace, backend: dict, views: list[View], truths
             [sys.executable, str(Path(__file__).resolve()), "--produce", json.dumps(job)], DRJIT_CACHE_DIR=str(cache)
         )
         images = [read_rgb(Path(folder) / f"{view.name}.exr") for view in views]
-    rows = told["views"]
-    return Production(seconds, [row["seconds"] for row in rows], spp=[row["spp"] for row in rows], **judged(images, truths))
+    rows = zip(images, truths, told["views"], strict=True)
+    found = [judged(image, truth, row["seconds"], f"{row['spp']:,}") for image, truth, row in rows]
+    return Production(seconds - sum(image.seconds for image in found), found)
 
 
 class Cycles:
@@ -453,33 +461,49 @@ class Cycles:
     def __init__(self, arguments: argparse.Namespace, gpu: bool):
         self.arguments, self.gpu, self.version = arguments, gpu, ""
 
-    def images(self, views: list[View], spp: list[int], *options: str) -> tuple[float, list[float], list[np.ndarray]]:
-        """(seconds of the process, seconds per view of export and render, images)."""
+    def production(self, views: list[View], truths: list[Truth], spp: int, *options: str) -> Production:
+        """The views by one process, denoised; ``seconds`` of a view are of export and render."""
         with tempfile.TemporaryDirectory() as folder:
             command = [self.arguments.cycles_python, str(ROOT / "bench" / "cycles.py"), *(str(view.arrays) for view in views)]
-            command += ["--out", folder, "--resolution", str(self.arguments.resolution), "--spp", *map(str, spp)]
-            command += ["--threads", str(self.arguments.threads), *(["--gpu"] if self.gpu else []), *options]
-            seconds, told = run(command)
+            command += ["--out", folder, "--resolution", str(self.arguments.resolution), "--spp", str(spp), "--denoise"]
+            command += ["--seed", str(self.arguments.seed + 1), "--threads", str(self.arguments.threads)]
+            seconds, told = run([*command, *(["--gpu"] if self.gpu else []), *options])
             self.version = told["blender"]
             images = [read_rgb(Path(folder) / f"{view.name}-0.exr") for view in views]
-        return seconds, [row["export"] + sum(row["renders"]) for row in told["scenes"]], images
+        each = [row["export"] + sum(row["renders"]) for row in told["scenes"]]
+        rows = zip(images, truths, each, strict=True)
+        return Production(seconds - sum(each), [judged(image, truth, took, f"{spp:,}") for image, truth, took in rows])
 
-    def production(self, views: list[View], truths: list[Truth], spp: list[int], *options: str) -> Production:
-        seconds, each, images = self.images(views, spp, "--seed", "1", "--denoise", *options)
-        return Production(seconds, each, spp=list(spp), **judged(images, truths))
+    def check(self) -> None:
+        """Fails now rather than at the end: an interpreter without Blender, a GPU that Cycles cannot use."""
+        told = run([self.arguments.cycles_python, str(ROOT / "bench" / "cycles.py"), *(["--gpu"] if self.gpu else [])])[1]
+        self.version = told["blender"]
 
-    def doubling(self, views: list[View], truths: list[Truth], errors: list[float]) -> list[list[Point]]:
-        """Per view: fixed sample counts from 16 on, denoised, until it has its error of ``errors`` or the most samples."""
+    def tuned(self, views: list[View], truths: list[Truth], mine: Production) -> tuple[Production, Production]:
+        """Every view at the fewest samples, doubling from 16, that have the error of ours; and interpolated to that error.
+
+        A view that would take more than twice our time, and longer than the patience, is left with what it has.
+        """
         points: list[list[Point]] = [[] for _ in views]
-        left, spp = list(range(len(views))), 16
+        last: list[Image] = [None] * len(views)
+        start_up, left, spp = 0.0, list(range(len(views))), 16
         while left and spp <= self.arguments.cycles_spp:
-            done = self.production([views[i] for i in left], [truths[i] for i in left], [spp] * len(left))
-            for i, seconds, error in zip(left, done.each, done.errors, strict=True):
-                points[i].append(Point(spp, seconds, error))
-            patient = [i for i in left if 2 * points[i][-1].seconds <= self.arguments.patience]
-            left = [i for i in patient if points[i][-1].error > errors[i]]
+            progress(f"Cycles, {spp} samples, {len(left)} views")
+            done = self.production([views[i] for i in left], [truths[i] for i in left], spp)
+            start_up = start_up or done.start_up
+            for i, image in zip(left, done.images, strict=True):
+                points[i].append(Point(spp, image.seconds, image.error))
+                last[i] = image
+            missed = [i for i in left if last[i].error > mine.images[i].error]
+            left = [i for i in missed if last[i].seconds <= max(self.arguments.patience / 2, mine.images[i].seconds)]
             spp *= 2
-        return points
+        even = []
+        for i, (image, ours) in enumerate(zip(last, mine.images, strict=True)):
+            at = crossing(points[i], ours.error)
+            if at is None:
+                last[i] = replace(image, samples=f"over {image.samples}")
+            even.append(replace(image, samples=f"{at.spp:,}", seconds=at.seconds, error=at.error) if at else last[i])
+        return Production(start_up, last), Production(start_up, even)
 
 
 def progress(text: str) -> None:
@@ -573,31 +597,20 @@ def print_fixed(
 def print_productions(views: list[View], productions: dict[str, Production]) -> None:
     """The first one is ours; every other is compared with it."""
     first = next(iter(productions.values()))
-    titles, rows = ["view"], [[view.name] for view in views]
-    for name, production in productions.items():
-        other = production is not first
-        titles += [f"{name}: samples", "s", "error", "at most", "mean", *(["s over ours"] if other else [])]
-        for index, row in enumerate(rows):
-            spp, seconds = production.spp[index], production.each[index]
-            row += [
-                "adaptive" if spp is None else f"{spp:,}",
-                f"{seconds:.2f}",
-                f"{production.errors[index]:.5f}",
-                f"{production.bounds[index]:.5f}",
-            ]
-            row += [f"{production.means[index] - 1:+.2%}", *([f"{seconds / first.each[index]:.2f}"] if other else [])]
-    table(titles, rows)
+    rows = []
+    for index, view in enumerate(views):
+        for name, production in productions.items():
+            image = production.images[index]
+            row = [view.name, name, image.samples, f"{image.seconds:.2f}", f"{image.seconds / first.images[index].seconds:.2f}"]
+            rows.append([*row, f"{image.error:.5f}", f"{image.bound:.5f}", f"{image.mean - 1:+.2%}"])
+    table(["view", "by", "samples", "s", "over ours", "error", "at most", "mean"], rows)
     rows = []
     for name, production in productions.items():
-        ratios = [a / b for a, b in zip(production.each, first.each, strict=True)]
-        row = [
-            name,
-            f"{production.seconds:.1f}",
-            f"{production.seconds - sum(production.each):.1f}",
-            f"{production.per_hour:,.0f}",
-        ]
-        row += [f"{first.per_hour / production.per_hour:.2f}", spread(production.each, ".2f"), spread(ratios, ".2f")]
-        rows.append([*row, spread(production.errors, ".5f")])
+        each = [image.seconds for image in production.images]
+        ratios = [seconds / image.seconds for seconds, image in zip(each, first.images, strict=True)]
+        row = [name, f"{production.seconds:.1f}", f"{production.start_up:.1f}", f"{production.per_hour:,.0f}"]
+        row += [f"{first.per_hour / production.per_hour:.2f}", spread(each, ".2f"), spread(ratios, ".2f")]
+        rows.append([*row, spread([image.error for image in production.images], ".5f")])
     titles = ["all views in one process", "s", "of them start-up", "views per hour", "ours over it"]
     table([*titles, "s per view: median (range)", "over ours: median (range)", "error: median (range)"], rows)
 
@@ -614,26 +627,19 @@ def print_machine(arguments: argparse.Namespace, backend: dict[str, Any]) -> Non
 
 
 def compare_with_cycles(
-    arguments: argparse.Namespace, cycles: Cycles, bench: Bench, views: list[View], truths: list[Truth], mine: Production
+    arguments: argparse.Namespace, cycles: Cycles, views: list[View], truths: list[Truth], mine: Production
 ) -> None:
     progress("Cycles at the released settings")
-    most = [arguments.cycles_spp] * len(views)
-    released = cycles.production(views, truths, most, "--mode", "released", "--adaptive", "0.01")
-    released.spp = [None] * len(views)
-    progress("Cycles, denoised, doubling the samples")
-    points = cycles.doubling(views, truths, mine.errors)
-    reached = [crossing(p, error) for p, error in zip(points, mine.errors, strict=True)]
-    progress("Cycles, tuned")
-    tuned = cycles.production(views, truths, [p[-1].spp for p in points])
-    even = replace(tuned, each=[(at or p[-1]).seconds for at, p in zip(reached, points, strict=True)])
-    even.spp = [(at or p[-1]).spp for at, p in zip(reached, points, strict=True)]
-    even.errors = [(at or p[-1]).error for at, p in zip(reached, points, strict=True)]
-    even.seconds = tuned.seconds - sum(tuned.each) + sum(even.each)
+    released = cycles.production(views, truths, arguments.cycles_spp, "--mode", "released", "--adaptive", "0.01")
+    for image in released.images:
+        image.samples = "adaptive"
+    tuned, even = cycles.tuned(views, truths, mine)
     print(f"\nAt target error {arguments.target:g}, start-up included, beside Blender {cycles.version}:")
-    print_productions(views, {"ours": mine, "(a)": released, "(b)": tuned, "(b')": even})
-    print("The error of (a) holds what its clamps and its wider pixel filter change on purpose.")
-    if None in reached:
-        print(f"(b) never had our error in {reached.count(None)} views: there it counts at its last, which favours it.")
+    print_productions(views, {"ours": mine, "(a) released": released, "(b) tuned": tuned, "(b') equal error": even})
+    print("The error of (a) holds what its clamps, its glossy lobe and its wider pixel filter change on purpose.")
+    missed = sum(image.samples.startswith("over") for image in tuned.images)
+    if missed:
+        print(f"(b) did not get to our error in {missed} views: there it counts at its last samples, which favours it.")
 
 
 def positive(kind: type) -> Callable[[str], Any]:
@@ -660,7 +666,7 @@ def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--truth-spp", type=whole, default=2048, help="default %(default)s")
     parser.add_argument("--cycles-spp", type=whole, default=4096, help="of Cycles, at most, default %(default)s")
     parser.add_argument(
-        "--patience", type=number, default=20.0, metavar="S", help="a longer render is left out; default %(default)s"
+        "--patience", type=number, default=10.0, metavar="S", help="a longer render is left out; default %(default)s"
     )
     parser.add_argument("--backend", choices=backends.CHOICES, default="auto")
     parser.add_argument("--threads", type=whole, default=os.cpu_count(), help="for each renderer, default all (%(default)s)")
@@ -683,13 +689,13 @@ def main() -> None:
     backend = backends.choose(arguments.backend)
     print_machine(arguments, backend)
     bench = Bench(arguments, backend)
+    cycles = Cycles(arguments, backend["backend"] == "cuda") if arguments.cycles_python else None
+    if cycles:
+        cycles.check()
     with tempfile.TemporaryDirectory() as folder:
         progress("scenes")
         scenes = read_scenes(arguments.scenes) if arguments.scenes else made_scenes(arguments.work)
         views = choose_views(scenes, arguments.views, Path(folder), backend, arguments.threads)
-        cycles = Cycles(arguments, backend["backend"] == "cuda") if arguments.cycles_python else None
-        if cycles:
-            cycles.images(views[:1], [1], "--resolution", "8", "--denoise")  # fails now rather than at the end
         truths, rates = [], []
         sweeps: dict[bool, list[list[Point]]] = {False: [], True: []}
         stops: dict[bool, list[dict]] = {False: [], True: []}
@@ -710,7 +716,7 @@ def main() -> None:
         progress("ours in a process of its own")
         mine = ours(arguments, backend, views, truths)
         if cycles:
-            compare_with_cycles(arguments, cycles, bench, views, truths, mine)
+            compare_with_cycles(arguments, cycles, views, truths, mine)
         else:
             print(f"\nAt target error {arguments.target:g}, start-up included (give --cycles-python to compare with Cycles):")
             print_productions(views, {"ours": mine})

@@ -45,10 +45,8 @@ def test_crossing_is_interpolated_between_doublings(bench):
 
 
 def test_views_per_hour_count_the_start_up(bench):
-    production = bench.Production(
-        seconds=30.0, each=[4.0, 6.0], errors=[0.001, 0.002], bounds=[0.001, 0.002], spp=[16, 32], means=[1.0, 1.0]
-    )
-    assert production.per_hour == pytest.approx(240)
+    images = [bench.Image("16", seconds, 0.002, 0.002, 1.0) for seconds in (4.0, 6.0)]
+    assert bench.Production(20.0, images).per_hour == pytest.approx(240)
 
 
 def test_bad_options_are_refused(bench, capsys):
