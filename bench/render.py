@@ -268,7 +268,7 @@ class Bench:
         return {"ours": samples / ours, "path": samples / theirs, "mean": mean}
 
     def doubling(self, view: View, truth: Truth, denoise: bool) -> list[Point]:
-        """Fixed sample counts from 16 on, until the smallest target or the patience is reached.
+        """Fixed sample counts from 16 on, to 64 at least, until the smallest target or the patience is reached.
 
         Without denoising, images of independent samples are averaged, so that only the last count is paid for.
         """
@@ -285,8 +285,8 @@ class Bench:
                 seconds += took
                 took, image = seconds, total
             points.append(Point(spp, took, truth.error(image)))
-            enough = points[-1].error <= min(self.arguments.targets) and spp >= RATE_SPP
-            if enough or spp >= self.arguments.max_spp or 2 * took > self.arguments.patience:
+            enough = points[-1].error <= min(self.arguments.targets) or 2 * took > self.arguments.patience
+            if spp >= max(RATE_SPP, self.arguments.max_spp) or (enough and spp >= RATE_SPP):
                 return points
             spp *= 2
 
@@ -296,11 +296,15 @@ class Bench:
         found: dict[float, dict] = {}
         took, patient = 0.0, self.arguments.patience * rate / self.pixels
         most = min(self.arguments.max_spp, 16 * 2 ** max(0, int(np.log2(patient / 16))))
+        last = None
         for target in sorted(self.arguments.targets, reverse=True):
+            if last and last["estimate"] <= target:  # the same render again
+                found[target] = last
+                continue
             if 4 * took > self.arguments.patience:  # half the error takes four times the samples
                 break
             took, record = self.render(view, "stop", most, denoise=denoise, target_error=target)
-            found[target] = {
+            last = found[target] = {
                 "spp": record.meta["spp"],
                 "seconds": took,
                 "estimate": record.meta["error"],
@@ -609,9 +613,13 @@ def print_productions(views: list[View], productions: dict[str, Production]) -> 
         each = [image.seconds for image in production.images]
         ratios = [seconds / image.seconds for seconds, image in zip(each, first.images, strict=True)]
         row = [name, f"{production.seconds:.1f}", f"{production.start_up:.1f}", f"{production.per_hour:,.0f}"]
-        row += [f"{first.per_hour / production.per_hour:.2f}", spread(each, ".2f"), spread(ratios, ".2f")]
+        row += [
+            f"{first.per_hour / production.per_hour:.2f}",
+            f"{sum(each) / sum(image.seconds for image in first.images):.2f}",
+        ]
+        row += [spread(each, ".2f"), spread(ratios, ".2f")]
         rows.append([*row, spread([image.error for image in production.images], ".5f")])
-    titles = ["all views in one process", "s", "of them start-up", "views per hour", "ours over it"]
+    titles = ["all views in one process", "s", "of them start-up", "views per hour", "ours over it", "without start-up"]
     table([*titles, "s per view: median (range)", "over ours: median (range)", "error: median (range)"], rows)
 
 
