@@ -39,6 +39,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -153,8 +154,7 @@ def made_scenes(work: Path) -> list[SceneRecord]:
     done = subprocess.run(command, cwd=ROOT, env=environment(), capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"error: making the scenes failed: {done.stdout[-1000:]}{done.stderr[-1000:]}")
-    newest = max((work / "store" / "scene").glob("*/manifest.json"), key=lambda path: path.stat().st_mtime).parent
-    return artifact_scenes(newest)
+    return artifact_scenes(work / "store" / re.findall(r"\bscene/\S+", done.stdout)[-1])
 
 
 def artifact_scenes(path: Path) -> list[SceneRecord]:
@@ -259,12 +259,18 @@ class Bench:
         return {"halves": raw, "denoised_halves": np.stack(clean[:2]), "image": clean[2]}
 
     def rates(self, view: View, repeats: int = 2) -> dict[str, float]:
-        """Samples per second, the best of ``repeats``, of our integrator and of the built-in one; the ratio of their means."""
+        """Samples per second, the best of ``repeats``, of our integrator and of the built-in one, both with the building of
+        the scene; the ratio of their means, noise included."""
+
+        def built_in(seed: int) -> tuple[float, np.ndarray]:
+            began = time.perf_counter()
+            image = BuiltIn(view.scene, self.arguments.resolution).render(RATE_SPP, seed)
+            return time.perf_counter() - began, image
+
         ours, image = min((self.render(view, "rate", RATE_SPP, denoise=False) for _ in range(repeats)), key=lambda r: r[0])
-        path = BuiltIn(view.scene, self.arguments.resolution)
-        theirs, built_in = min((path.render(RATE_SPP, seed) for seed in range(repeats + 1)), key=lambda r: r[0])
+        theirs, image_of_path = min((built_in(seed) for seed in range(repeats + 1)), key=lambda r: r[0])
         samples = self.pixels * RATE_SPP
-        mean = float(np.minimum(image.image, 4).mean() / np.minimum(built_in, 4).mean())
+        mean = float(np.minimum(image.image, 4).mean() / np.minimum(image_of_path, 4).mean())
         return {"ours": samples / ours, "path": samples / theirs, "mean": mean}
 
     def doubling(self, view: View, truth: Truth, denoise: bool) -> list[Point]:
@@ -298,7 +304,7 @@ class Bench:
         most = min(self.arguments.max_spp, 16 * 2 ** max(0, int(np.log2(patient / 16))))
         last = None
         for target in sorted(self.arguments.targets, reverse=True):
-            if last and last["estimate"] <= target:  # the same render again
+            if last and (last["estimate"] <= target or last["spp"] >= most):  # the same render again
                 found[target] = last
                 continue
             if 4 * took > self.arguments.patience:  # half the error takes four times the samples
@@ -353,13 +359,11 @@ class BuiltIn:
         )
         self.integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
 
-    def render(self, spp: int, seed: int) -> tuple[float, np.ndarray]:
-        """(seconds, (H, W, 3) image)"""
+    def render(self, spp: int, seed: int) -> np.ndarray:
+        """(H, W, 3) image"""
         import mitsuba as mi
 
-        began = time.perf_counter()
-        image = np.array(mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=spp, seed=seed))
-        return time.perf_counter() - began, image
+        return np.array(mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=spp, seed=seed))
 
 
 def warm_up(scene: SceneRecord, backend: dict[str, Any], threads: int) -> None:
