@@ -4,7 +4,7 @@
 
 PYTHON has ``bpy`` (``python3.11 -m venv B && B/bin/pip install bpy==5.0.1``). Without ``--scenes`` (scene files, folders of
 them, or a scene artifact of a store) it makes a small scene artifact by the released law from procedural objects. Lights are
-hidden from cameras, as in the released data. About 25 minutes on 2 quiet cores; ``--views 2``, ``--resolution 128``,
+hidden from cameras, as in the released data. Some 25 minutes on 2 quiet cores; ``--views 2``, ``--resolution 128``,
 ``--truth-spp 512`` and ``--patience 5`` cut that. Artifacts and truths are kept in ``--work`` for the next run.
 
 It prints, with the spread over views:
