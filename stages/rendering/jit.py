@@ -21,9 +21,10 @@ import numpy as np
 
 from stages.records import SceneRecord
 from stages.rendering.lights import SLOTS, LightTable
+from stages.rendering.material import Material
 from stages.rendering.sobol import Sampler, mixed
 from stages.rendering.sums import Sums
-from stages.rendering.surfaces import FirstHitAlbedo, floats, surface_mesh
+from stages.rendering.surfaces import floats, shape_mesh
 
 BLOCK = 8  # samples of a lane: also the steps in which samples can be asked for
 CHUNK = 1 << 19  # lanes in flight: 40 floats of results each, about 80 MB
@@ -43,6 +44,8 @@ class Limits:
     glossy_bounces: int = 1 << 20
     indirect_clamp: float = float("inf")  # bound on the mean over RGB of one indirect contribution, after Cycles
     filter: str = "box"
+    glossy_filter: bool = False  # after a wide scattering the lobe of the next surface is at least half as wide, after Cycles
+    multiscatter: bool = False  # between the facets of rough surfaces
 
 
 def filter_offsets(name: str) -> np.ndarray:
@@ -119,7 +122,7 @@ def _add(slots: list, slot: mi.Int32, value: mi.Color3f) -> list:
 
 
 @dr.syntax
-def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide, diffuse_start):
+def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start):
     """Sums over the samples of each lane: (light slots, direct, albedo, normal, distance, hits, nearest distance, triangle).
 
     ``limits``: opaque (bounces, diffuse bounces, glossy bounces, indirect clamp on the sum over RGB). ``hide``: opaque
@@ -127,7 +130,6 @@ def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide, diffuse_st
     ``diffuse_start``: the first surface is a white diffuse one, whatever its material.
     """
     max_bounces, max_diffuse, max_glossy, clamp = limits
-    context = mi.BSDFContext()
     slots = [mi.Color3f(0) for _ in range(SLOTS)]
     direct, albedos, normals = mi.Color3f(0), mi.Color3f(0), mi.Normal3f(0)
     distances, hits, nearest = mi.Float(0), mi.Float(0), mi.Float(dr.inf)
@@ -137,7 +139,7 @@ def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide, diffuse_st
     ray = dr.zeros(mi.Ray3f)
     origin = mi.Point3f(0)
     fresh = mi.Bool(True)
-    throughput, bsdf_pdf = mi.Color3f(1), mi.Float(0)
+    throughput, bsdf_pdf, widest = mi.Color3f(1), mi.Float(0), mi.Float(dr.inf)  # widest: least density so far
     bounce, diffuse, glossy = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
 
     while done < lanes.count:
@@ -159,8 +161,9 @@ def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide, diffuse_st
         first = found & (bounce == 0) & ~through
         facing = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -1, 1)
         distance = dr.norm(si.p - origin)
+        lobes = material.at(si, found)
         normals += dr.select(first, si.sh_frame.n * facing, 0)
-        albedos += dr.select(first, albedo.eval(si, first), 0)
+        albedos += dr.select(first, lobes.diffuse + lobes.specular, 0)
         distances += dr.select(first, distance, 0)
         nearest = dr.minimum(nearest, dr.select(first, distance, dr.inf))
         hits += dr.select(first, 1, 0)
@@ -178,7 +181,12 @@ def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide, diffuse_st
 
         # Next-event estimation at surfaces; lights reflect nothing.
         surface = found & ~on_light & (bounce < max_bounces) & (diffuse <= max_diffuse) & (glossy <= max_glossy)
-        bsdf = si.bsdf(ray)
+        if glossy_filter:
+            blurred = 0.5 * dr.sqrt(dr.maximum(1 - widest, 0))
+            lobes.alpha = dr.select(widest < 1, dr.maximum(lobes.alpha, blurred), lobes.alpha)
+        if diffuse_start:
+            white = bounce == 0
+            lobes.diffuse, lobes.specular = dr.select(white, 1, lobes.diffuse), dr.select(white, 0, lobes.specular)
         choice = sampler.two(dimension + LIGHT_AND_LOBE)
         lit, point = lights.sample(choice.x, sampler.two(dimension + LIGHT_POINT))
         shadow = si.spawn_ray_to(point)
@@ -188,11 +196,7 @@ def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide, diffuse_st
         cosine = dr.abs(dr.dot(dr.gather(mi.Normal3f, lights.normal, lit), to_light))
         density = dr.gather(mi.Float, lights.density, lit)
         sampled = surface & (cosine > 0) & (distance2 > 0) & (density > 0)
-        reflected, pdf = bsdf.eval_pdf(context, si, si.to_local(to_light), sampled)
-        if diffuse_start:
-            # cosine over pi on the side of the viewer is both the white material times the cosine and its density
-            lambert = dr.maximum(dr.dot(si.sh_frame.n, to_light) * facing, 0) * dr.inv_pi
-            reflected, pdf = dr.select(bounce == 0, lambert, reflected), dr.select(bounce == 0, lambert, pdf)
+        reflected, pdf = material.evaluate(lobes, si.wi, si.to_local(to_light))
         sampled &= dr.max(reflected) > 0
         sampled &= ~scene.ray_test(shadow, sampled)
         light_pdf = density * distance2 / dr.maximum(cosine, 1e-9)
@@ -202,30 +206,25 @@ def trace_paths(scene, lights, albedo, lanes, pass_key, limits, hide, diffuse_st
         direct += dr.select(bounce == 0, value, 0)
 
         # The next direction, from the material.
-        spot = sampler.two(dimension + DIRECTION)
-        sample, scattered = bsdf.sample(context, si, choice.y, spot, surface)
-        if diffuse_start:
-            wo = mi.warp.square_to_cosine_hemisphere(spot)
-            wo.z = wo.z * facing
-            sample.wo = dr.select(bounce == 0, wo, sample.wo)
-            sample.pdf = dr.select(bounce == 0, dr.abs(wo.z) * dr.inv_pi, sample.pdf)
-            scattered = dr.select(bounce == 0, 1, scattered)
-        is_glossy = mi.has_flag(sample.sampled_type, mi.BSDFFlags.GlossyReflection)
+        wo, is_glossy = material.sample(lobes, si.wi, choice.y, sampler.two(dimension + DIRECTION))
+        scattered, pdf = material.evaluate(lobes, si.wi, wo)
         glossy += dr.select(surface & is_glossy, 1, 0)
         diffuse += dr.select(surface & ~is_glossy, 1, 0)
         bounce += dr.select(surface, 1, 0)
-        throughput = dr.select(surface, throughput * scattered, throughput)
-        bsdf_pdf = dr.select(surface, sample.pdf, bsdf_pdf)
+        throughput = dr.select(surface, throughput * dr.select(pdf > 0, scattered / pdf, 0), throughput)
+        bsdf_pdf = dr.select(surface, pdf, bsdf_pdf)
+        widest = dr.select(surface, dr.minimum(widest, pdf), widest)
         brightest = dr.max(throughput)
         survival = dr.select(bounce >= RR_DEPTH, dr.minimum(brightest, 0.95), 1)
         lives = surface & (brightest > 0) & (sampler.one(dimension + ROULETTE) < survival)
         throughput = dr.select(lives, throughput / survival, throughput)
-        ray = dr.select(through, si.spawn_ray(ray.d), si.spawn_ray(si.to_world(sample.wo)))
+        ray = dr.select(through, si.spawn_ray(ray.d), si.spawn_ray(si.to_world(wo)))
 
         # The path goes on, or the lane's next sample begins.
         fresh = ~(lives | through)
         done += dr.select(fresh, 1, 0)
         throughput, bsdf_pdf = dr.select(fresh, 1, throughput), dr.select(fresh, 0, bsdf_pdf)
+        widest = dr.select(fresh, dr.inf, widest)
         bounce, diffuse, glossy = [dr.select(fresh, 0, count) for count in (bounce, diffuse, glossy)]
 
     return slots, direct, albedos, normals, distances, hits, nearest, triangle
@@ -249,9 +248,8 @@ class JitRenderer:
     def __init__(self, scene: SceneRecord, resolution: int, seed: int, limits: Limits, lights_visible: bool):
         self.record, self.resolution, self.seed = scene, resolution, seed
         self.limits, self.lights_visible = limits, lights_visible
-        mesh = surface_mesh(scene, np.arange(len(scene.triangles)))
-        self.scene = mi.load_dict({"type": "scene", "surface": mesh})
-        self.albedo = FirstHitAlbedo(scene)
+        self.scene = mi.load_dict({"type": "scene", "surface": shape_mesh(scene)})
+        self.material = Material(scene, limits.multiscatter)
         self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
         self.cameras = Cameras(scene, resolution, limits.filter)
 
@@ -344,7 +342,7 @@ class JitRenderer:
         hide = dr.opaque(mi.Bool, not self.lights_visible)
         pass_key = opaque(number * 0x5851F42D)
         white = isinstance(rays, Points)
-        out = trace_paths(self.scene, table, self.albedo, lanes, pass_key, bounds, hide, white)
+        out = trace_paths(self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white)
         dr.eval(out)
         slots, *wide, distances, hits, nearest, triangle = out
         size = len(pixel)

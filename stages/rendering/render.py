@@ -3,10 +3,9 @@ experiments.
 
 Modes:
 - ``physical``: no clamping, box pixel filter, deep paths with Russian roulette, single-scattering GGX.
-- ``cycles``: Cycles' defaults as far as they can be matched: at most 12 bounces, 4 diffuse, 4 glossy, indirect
-  contributions clamped at 10, Blackman-Harris pixel filter of 1.5 pixels. Not matched: multiple-scattering GGX, the
-  glossy filter (1.0), adaptive sampling, Cycles' random numbers and its own choice of lights (which decides what the
-  clamp cuts).
+- ``cycles``: Cycles' defaults as far as they can be matched: at most 12 bounces, 4 diffuse, 4 glossy, indirect contributions
+  clamped at 10, Blackman-Harris pixel filter of 1.5 pixels, glossy filter 1.0, multiple-scattering GGX. Not matched: adaptive
+  sampling, Cycles' random numbers and its own choice of lights (which decides what the clamp cuts).
 """
 
 from __future__ import annotations
@@ -110,7 +109,7 @@ def _sampler(
     limits = (
         Limits(max_depth - 1)
         if mode == "physical"
-        else Limits(min(max_depth - 1, 13), 4, 4, indirect_clamp=10.0, filter="blackman-harris")
+        else Limits(min(max_depth - 1, 13), 4, 4, 10.0, "blackman-harris", glossy_filter=True, multiscatter=True)
     )
     return JitRenderer(scene, resolution, seed, limits, lights_visible).sample
 

@@ -1,9 +1,9 @@
 """Mitsuba meshes, materials and cameras straight from a SceneRecord's arrays: no mesh file between the renderer and the
 data.
 
-The material diffuse / pi + specular * GGX is ``twosided(blendbsdf(diffuse, roughconductor))`` with the two
-reflectances divided by their blend weights. Emitting triangles are black. Vertices are unshared, so that face
-attributes, corner normals and texture coordinates hold.
+Mitsuba's own integrators take diffuse / pi + specular * GGX as ``twosided(blendbsdf(diffuse, roughconductor))`` with the two
+reflectances divided by their blend weights; ours reads the same parameters itself (``stages.rendering.material``). Emitting
+triangles are black. Vertices are unshared, so that face attributes, corner normals and texture coordinates hold.
 
 Design choice: a parameter that no triangle's patch varies is a face attribute, the same kernels as in a scene without
 textures; one that varies is an *atlas*, one picture with a tile per triangle. A textured triangle's tile is its patch with
@@ -38,16 +38,18 @@ def face_normals(triangles: np.ndarray) -> np.ndarray:
 class Surfaces:
     """What the renderer knows of the triangles ``faces`` (indices) of a scene: their parameters and where their patches lie.
 
-    Triangle i of everything here is faces[i]. Emitting triangles are black and constant. Parameters are ``diffuse`` and
-    ``specular`` (each over its blend weight), ``alpha``, and ``albedo``, the sum of the two undivided.
+    Triangle i of everything here is faces[i]. Emitting triangles are black and constant. Parameters are ``diffuse``,
+    ``specular``, ``alpha``, and ``albedo``, the sum of the first two; ``blended``: those two over their blend weights.
     """
 
-    def __init__(self, scene: SceneRecord, faces: np.ndarray):
+    def __init__(self, scene: SceneRecord, faces: np.ndarray, blended: bool = False):
         emits = scene.light_index[faces] >= 0
         black = np.where(emits, np.float32(0), np.float32(1))[:, None]
         diffuse, specular = scene.diffuse[faces] * black, scene.specular[faces] * black
         self.weight = np.clip(specular.max(axis=1), 0, MAX_WEIGHT)
-        self._below, self._above = (1 - self.weight)[:, None], np.where(self.weight > 0, self.weight, 1)[:, None]
+        self._below, self._above = np.ones((2, len(faces), 1), np.float32)
+        if blended:
+            self._below, self._above = (1 - self.weight)[:, None], np.where(self.weight > 0, self.weight, 1)[:, None]
         self.values = {
             "diffuse": diffuse / self._below,
             "specular": specular / self._above,
@@ -158,24 +160,16 @@ def atlas_texture(picture: np.ndarray) -> Any:
     return mi.load_dict({"type": "bitmap", "data": mi.TensorXf(picture), **options})
 
 
-class FirstHitAlbedo:
-    """diffuse + specular at a surface interaction of a mesh of all triangles, 0 on emitters (JIT variants only)."""
-
-    def __init__(self, scene: SceneRecord):
-        surfaces = Surfaces(scene, np.arange(len(scene.triangles)))
-        varies = "albedo" in surfaces.varying
-        self.texture = atlas_texture(surfaces.picture("albedo")) if varies else None
-        self.values = None if varies else floats(surfaces.values["albedo"])
-
-    def eval(self, si: Any, active: Any) -> Any:
-        if self.texture is None:
-            return dr.gather(mi.Color3f, self.values, si.prim_index, active)
-        return self.texture.eval(si, active)
+def shape_mesh(scene: SceneRecord) -> mi.Mesh:
+    """All triangles without a material of Mitsuba's, with texture coordinates where patches need them."""
+    surfaces = Surfaces(scene, np.arange(len(scene.triangles)))
+    coordinates = surfaces.atlas.coordinates() if surfaces.varying else None
+    return mesh_of(scene.triangles, scene.vertex_normals, coordinates=coordinates)
 
 
 def surface_mesh(scene: SceneRecord, faces: np.ndarray, albedo_only: bool = False) -> mi.Mesh:
     """The triangles ``faces`` (indices) as one mesh; triangle i of the mesh is faces[i]."""
-    surfaces = Surfaces(scene, faces)
+    surfaces = Surfaces(scene, faces, blended=True)
     coordinates = surfaces.atlas.coordinates() if surfaces.varying else None
     bsdf = material(surfaces, albedo_only)
     mesh = mesh_of(scene.triangles[faces], scene.vertex_normals[faces], bsdf, coordinates=coordinates)

@@ -464,7 +464,7 @@ def test_radiance_at_texels_is_what_a_camera_sees_of_diffuse_surfaces(jit):
     assert kept.sum() == len(weights) == 528 + 31 and np.allclose(weights.sum(axis=1), 1)
     scene = clutter(lights=2, cameras=1)
     scene.specular[:2] = 0  # the floor
-    radiance, met = texel_radiance(scene, [0, 1, 4, len(scene.triangles) - 1], spp=64, seed=0, backend=jit, size=16)
+    radiance, met = texel_radiance(scene, [0, 1, 4, len(scene.triangles) - 1], spp=1024, seed=0, backend=jit, size=16)
     assert radiance.shape == (4, 2, 16, 16, 3) and met[:2].sum() == 2 * texel_weights(16)[0].sum()
     assert not radiance[:, :, ~texel_weights(16)[0]].any() and not radiance[3].any() and not met[3].any()
     # against a camera that looks straight down at a few texels of the floor
@@ -479,3 +479,55 @@ def test_radiance_at_texels_is_what_a_camera_sees_of_diffuse_surfaces(jit):
         np.testing.assert_allclose(radiance[0, :, row, column], view.lights.mean(axis=(1, 2)), rtol=0.1)
     with pytest.raises(UserError, match="JIT"):
         texel_radiance(scene, [0], spp=1, seed=0, backend=SCALAR)
+
+
+@pytest.mark.parametrize("roughness", [0.05, 0.4, 1.0])
+def test_multiple_scattering_returns_what_single_scattering_loses(jit, roughness):
+    """A white furnace at any roughness, seen straight and at a grazing angle; single scattering darkens the rough ones."""
+    sky = [
+        quad(sign * np.eye(3)[a] * 3, np.eye(3)[(a + 1) % 3] * 3, np.eye(3)[(a + 2) % 3] * 3)
+        for a in range(3)
+        for sign in (-1, 1)
+    ]
+    plate = quad((0, 0, 0), (0.5, 0, 0), (0, 0.5, 0))
+    poses = [camera((0, -0.1, 2)), camera((0, -2, 0.5))]
+    scene = build([(plate, 0, 1, roughness)], [(np.concatenate(sky), 1)], poses, fov=5.0)
+    kept = {"max_spp": 64, "seed": 0, "backend": jit, "denoise": False, "lights_visible": True}
+    single, multiple = ([view.image.mean() for view in render_views(scene, 16, mode=m, **kept)] for m in ("physical", "cycles"))
+    assert np.allclose(multiple, 1, atol=0.01)
+    assert np.allclose(single, 1, atol=0.01) == (roughness < 0.3) and max(single) < 1.005
+
+
+def test_material_is_ggx_with_correlated_masking(jit):
+    """The BSDF and its density against the formulas, in numpy, on either side; directions follow their density."""
+    backends.activate(jit)
+    import mitsuba as mi
+
+    from stages.rendering.material import Lobes, Material
+
+    material = Material(clutter(), multiscatter=False)
+    rng = np.random.default_rng(0)
+    wi, wo = rng.normal(size=(2, 3, 400_000))
+    wi, wo = wi / np.linalg.norm(wi, axis=0), wo / np.linalg.norm(wo, axis=0)
+    wi[:, :200_000] = np.array([[0.6], [0], [0.8]])
+    alpha, diffuse, specular = 0.3, np.array([0.2, 0.3, 0.1]), np.array([0.5, 0.4, 0.6])
+    lobes = Lobes(mi.Color3f(*map(float, diffuse)), mi.Color3f(*map(float, specular)), mi.Float(alpha))
+    value, density = material.evaluate(lobes, mi.Vector3f(wi), mi.Vector3f(wo))
+
+    def loss(w):  # Smith's lambda
+        return 0.5 * (np.sqrt(1 + alpha**2 * (1 / w[2] ** 2 - 1)) - 1)
+
+    half = wi * np.sign(wi[2]) + wo * np.sign(wi[2])
+    half /= np.linalg.norm(half, axis=0)
+    ndf = alpha**2 / np.pi / (half[2] ** 2 * (alpha**2 - 1) + 1) ** 2
+    lobe = ndf / (1 + loss(wi) + loss(wo)) / (4 * np.abs(wi[2]))
+    same = wi[2] * wo[2] > 0
+    expected = np.where(same, diffuse[:, None] / np.pi * np.abs(wo[2]) + specular[:, None] * lobe, 0)
+    np.testing.assert_allclose(np.array(value), expected, rtol=2e-3, atol=1e-5)
+    drawn, _ = material.sample(lobes, mi.Vector3f(wi), mi.Float(rng.random(400_000)), mi.Point2f(rng.random((2, 400_000))))
+    albedo, pdf = (np.array(part) for part in material.evaluate(lobes, mi.Vector3f(wi), drawn))
+    # what the density leaves out is sent below the surface
+    kept = (np.array(drawn)[2, :200_000] > 0).mean()
+    assert 0.9 < kept < 0.99 and 4 * np.pi * np.array(density)[:200_000].mean() == pytest.approx(kept, abs=0.01)
+    by_lobes = np.mean(np.where(pdf > 0, albedo / np.maximum(pdf, 1e-9), 0)[:, :200_000], axis=1)
+    np.testing.assert_allclose(by_lobes, 4 * np.pi * expected[:, :200_000].mean(axis=1), rtol=0.02)
