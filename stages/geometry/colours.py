@@ -9,6 +9,7 @@ is kept is at most ``MAX_SIDE`` pixels wide, averaged in linear light.
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import io
 import json
@@ -183,14 +184,11 @@ def parse_library(data: bytes) -> dict[str, dict[str, Any]]:
         if key == "newmtl":
             current = materials.setdefault(" ".join(rest.split()), {})
         elif key == "kd":
-            numbers = [float(word) for word in rest.split()[:3] if re.fullmatch(r"[-+.\deE]+", word)]
-            if len(numbers) == 3:
-                current["colour"] = tuple(float(x) for x in np.nan_to_num(np.clip(numbers, 0, 1)))
+            with contextlib.suppress(ValueError):  # it may also name a spectrum
+                r, g, b = (float(np.nan_to_num(np.clip(float(word), 0, 1))) for word in rest.split()[:3])
+                current["colour"] = r, g, b
         elif key == "map_kd":
-            name = rest.split()[-1] if rest.startswith("-") else rest  # options come before the name
-            if name.startswith("-clamp") or not name:
-                continue
-            current["map"] = name
+            current["map"] = rest.split()[-1] if rest.startswith("-") else rest  # options come before the name
             if re.search(r"-clamp\s+on", rest):
                 current["wrap"] = "clamp"
     return materials
@@ -295,7 +293,6 @@ def texture_record(id: str, parts: list[tuple[Material, np.ndarray | None, int]]
     there is neither an image nor a second colour.
     """
     coordinates = np.concatenate([np.zeros((count, 3, 2)) if uv is None else uv for _, uv, count in parts])[kept]
-    coordinates = np.nan_to_num(coordinates, posinf=0, neginf=0)
     ends = np.searchsorted(kept, np.cumsum([0, *(count for _, _, count in parts)]))
     rows: dict[tuple, int] = {}
     images: dict[str, int] = {}
@@ -318,6 +315,7 @@ def texture_record(id: str, parts: list[tuple[Material, np.ndarray | None, int]]
     if not pictures and len(rows) < 2:
         return None
     colour, image, wrap = zip(*rows, strict=True)
+    coordinates = np.nan_to_num(coordinates, posinf=0, neginf=0)
     return TextureRecord(
         id, coordinates.astype(np.float32), material, np.float32(colour), np.int16(image), np.uint8(wrap), pictures
     )

@@ -30,6 +30,7 @@ BLOCK = 8  # samples of a lane: also the steps in which samples can be asked for
 CHUNK = 1 << 19  # lanes in flight: 40 floats of results each, about 80 MB
 RR_DEPTH = 5  # bounces before Russian roulette may end a path
 FILTER_CELLS = 1024
+BLACKMAN_HARRIS_SPAN = 3.0  # pixels from end to end: what Blender calls a width of 1.5
 # Dimensions of a bounce for the sampler; camera rays come before the first bounce.
 LIGHT_AND_LOBE, LIGHT_POINT, DIRECTION, ROULETTE, DIMENSIONS = range(5)
 FILM = 0xFFFFFFFF
@@ -57,11 +58,11 @@ def filter_offsets(name: str) -> np.ndarray:
     if name == "box":
         return u - 0.5
     assert name == "blackman-harris", name
-    x = np.linspace(-0.5, 0.5, 8 * FILTER_CELLS + 1)  # four-term Blackman-Harris window, 1.5 pixels wide
+    x = np.linspace(-0.5, 0.5, 8 * FILTER_CELLS + 1)  # four-term Blackman-Harris window
     angle = 2 * np.pi * (x + 0.5)
     weight = 0.35875 - 0.48829 * np.cos(angle) + 0.14128 * np.cos(2 * angle) - 0.01168 * np.cos(3 * angle)
     cumulative = np.concatenate([[0], np.cumsum(weight[1:] + weight[:-1])])
-    return 1.5 * np.interp(u, cumulative / cumulative[-1], x)
+    return BLACKMAN_HARRIS_SPAN * np.interp(u, cumulative / cumulative[-1], x)
 
 
 class Cameras:

@@ -4,7 +4,7 @@ experiments.
 Modes:
 - ``physical``: no clamping, box pixel filter, deep paths with Russian roulette, single-scattering GGX.
 - ``cycles``: Cycles' defaults as far as they can be matched: at most 12 bounces, 4 diffuse, 4 glossy, indirect contributions
-  clamped at 10, Blackman-Harris pixel filter of 1.5 pixels, glossy filter 1.0, multiple-scattering GGX. Not matched: adaptive
+  clamped at 10, Blackman-Harris pixel filter (width 1.5), glossy filter 1.0, multiple-scattering GGX. Not matched: adaptive
   sampling, Cycles' random numbers and its own choice of lights (which decides what the clamp cuts).
 """
 

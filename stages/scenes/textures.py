@@ -102,10 +102,7 @@ def transfer(
     vertices = np.ascontiguousarray(vertices, np.float64)
     faces = np.ascontiguousarray(faces[kept], np.int64)
     material, uv = texture.material[kept].astype(np.int64), texture.uv[kept].astype(np.float64)
-    sizes = np.array([(1, 1)] + [(image.shape[1], image.shape[0]) for image in texture.images], np.float64)
-    pixels = _areas(uv * sizes[texture.image[material].astype(np.int64) + 1][:, None])
-    grid = _grid_for(float(np.minimum(pixels, 1e9).sum()), len(triangles))
-    weights = texel_points(grid)
+    weights = texel_points(points_per_side(texture, len(triangles)))
     corners = vertices[faces]
     tree = igl.AABB()
     tree.init(vertices, faces)
@@ -125,6 +122,14 @@ def transfer(
         return out
 
     return _means(colours, len(triangles), weights.shape)
+
+
+def points_per_side(texture: TextureRecord, count: int) -> int:
+    """Of the grid of points that a texel of ``count`` triangles is the mean of."""
+    sizes = np.array([(1, 1)] + [(image.shape[1], image.shape[0]) for image in texture.images], np.float64)
+    scale = sizes[texture.image[texture.material].astype(np.int64) + 1]
+    pixels = _areas(texture.uv.astype(np.float64) * scale[:, None])
+    return _grid_for(float(np.minimum(pixels, 1e9).sum()), count)
 
 
 def seen_faces(vertices: np.ndarray, faces: np.ndarray, number: int = 60000) -> np.ndarray:

@@ -374,8 +374,8 @@ def test_cycles_mode_clamps_filters_and_limits(jit):
     from stages.rendering.jit import filter_offsets
 
     offsets = filter_offsets("blackman-harris")
-    assert offsets[0] == -0.75 and offsets[-1] == 0.75 and np.allclose(offsets, -offsets[::-1], atol=1e-6)
-    assert 0.18 < offsets.std() < 0.22  # the window's standard deviation, in pixels
+    assert offsets[0] == -1.5 and offsets[-1] == 1.5 and np.allclose(offsets, -offsets[::-1], atol=1e-6)
+    assert 0.37 < offsets.std() < 0.42  # the window's standard deviation, in pixels
     scene = clutter(cameras=1)
     kept = {"max_spp": 64, "seed": 0, "backend": jit, "denoise": False}
     physical, cycles = (render_views(scene, 16, mode=mode, **kept)[0] for mode in ("physical", "cycles"))
