@@ -66,6 +66,7 @@ def render_views(
     streams = [0, 1] if target_error > 0 and max_spp > 1 else [0]
     total = max_spp // len(streams)  # of each stream
     step = min(FIRST_SPP // 2, total) if len(streams) > 1 else total
+    due = dict.fromkeys(active, 0)  # samples before which an estimate is not worth its cost
     while active:
         for stream, found in enumerate(sample(active, streams, taken, step)):
             for view, sums in zip(active, found, strict=True):
@@ -74,11 +75,15 @@ def render_views(
         taken += step
         left = []
         for view in active:
+            if 2 * taken <= due[view] and taken < total:  # even twice as many would not do
+                left.append(view)
+                continue
             parts = list(halves[view].values())
             sums = functools.reduce(operator.add, parts)
             seen, *others = (part.view(scene.object_index) for part in (sums, *parts))
             estimate = estimated_error(*others, seen, denoise) if len(others) > 1 else None
             if taken < total and estimate is not None and estimate > target_error:
+                due[view] = taken * (estimate / target_error) ** 2  # no error falls faster than by the square root
                 left.append(view)
             else:
                 del halves[view]
