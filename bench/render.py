@@ -26,8 +26,9 @@ the price is a bias that it shares with the denoised images that it judges, ours
 the error against the raw truth, whose noise adds by its variance, to first order, and is taken out by extrapolation (twice the
 error against the mean of the halves, less the mean error against each half; with fireflies not wholly). The smaller of
 the two counts as the error; where they agree the figure is sure. The noise of a truth is half the difference of its halves.
-Cycles is judged by a truth of its own, made the same way with as many samples and the guides of ours: the two renderers agree
-to a few tenths of a per cent (a table says how well), but that is not far below the smallest targets. The column "mean" (of values clamped at 4, over the raw truth's) shows how far an image is on the whole.
+Cycles is judged by a truth of its own, made the same way with as many samples and the guides of ours: the renderers agree to a
+few tenths of a per cent (a table says how well), but that is not far below the smallest targets. The column "mean" (of values
+clamped at 4, over the raw truth's) shows how far an image is on the whole.
 """
 
 from __future__ import annotations
