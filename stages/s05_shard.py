@@ -131,6 +131,7 @@ FIELDS = """
 | view<i>.exr | direct | (H, W, 3) | float16 | linear radiance after at most one bounce, all lights |
 | view<i>.exr | albedo, normal | (H, W, 3) | float16 | first hit: diffuse + specular; world shading normal |
 | view<i>.exr | depth, coverage | (H, W) | float16 | distance along the ray in units, 0 = nothing; hit share of the pixel |
+| view<i>.exr | triangle, object | (H, W) | uint32 | first sample's hit plus one: row of triangles, object_index; 0 = nothing |
 """
 
 
