@@ -27,6 +27,7 @@ from stages.rendering.sums import Sums
 from stages.rendering.surfaces import floats, shape_mesh
 
 BLOCK = 8  # samples of a lane: also the steps in which samples can be asked for
+GROUP = 64  # blocks of a pixel that the host adds at once
 CHUNK = 1 << 19  # lanes in flight: 40 floats of results each, about 80 MB
 RR_DEPTH = 5  # bounces before Russian roulette may end a path
 FILTER_CELLS = 1024
@@ -294,25 +295,30 @@ class JitRenderer:
         spp: int,
     ) -> dict[str, np.ndarray]:
         """(streams, pixels, ..) sums over the samples, float64; ``lights`` (.., SLOTS, 3)."""
-        blocks = -(-spp // BLOCK)
-        lane_count = len(streams) * len(ids) * blocks
-        results: dict[str, list[np.ndarray]] = {}
-        for start in range(0, lane_count, CHUNK):
-            lane = np.arange(start, min(start + CHUNK, lane_count))
-            row, block = lane // blocks, lane % blocks
-            stream = np.asarray(streams)[row // len(ids)]
-            counts = np.minimum(BLOCK, spp - block * BLOCK)
-            values = self._chunk(table, number, rays, ids[row % len(ids)], stream, first + block * BLOCK, counts)
-            for name, value in values.items():
-                results.setdefault(name, []).append(value)
-        whole = {name: np.concatenate(parts, axis=-1) for name, parts in results.items()}
-
-        def shaped(values: np.ndarray) -> np.ndarray:  # (.., lanes) -> (streams, pixels, blocks, ..)
-            return np.moveaxis(values.reshape(*values.shape[:-1], len(streams), len(ids), blocks), (-3, -2, -1), (0, 1, 2))
-
-        summed = ("lights", "direct", "albedo", "normal", "distance", "hits")
-        sums = {name: shaped(whole[name]).sum(axis=2, dtype=np.float64) for name in summed}
-        return sums | {"nearest": shaped(whole["nearest"]).min(axis=2), "triangle": shaped(whole["triangle"])[:, :, 0]}
+        rows, blocks = len(streams) * len(ids), -(-spp // BLOCK)
+        sums: dict[str, np.ndarray] = {}
+        for block in range(0, blocks, GROUP):
+            depth = min(GROUP, blocks - block)
+            step = max(CHUNK // depth, 1)
+            for start in range(0, rows, step):
+                row = np.arange(start, min(start + step, rows)).repeat(depth)
+                number_of = block + np.tile(np.arange(depth), len(row) // depth)
+                counts = np.minimum(BLOCK, spp - number_of * BLOCK)
+                where = ids[row % len(ids)], np.asarray(streams)[row // len(ids)], first + number_of * BLOCK, counts
+                for name, value in self._chunk(table, number, rays, *where).items():
+                    parts = value.reshape(*value.shape[:-1], -1, depth)
+                    part = slice(start, start + parts.shape[-2])
+                    if name == "triangle":
+                        total = sums.setdefault(name, np.zeros(rows, np.int32))
+                        total[part] = parts[:, 0] if block == 0 else total[part]
+                    elif name == "nearest":
+                        total = sums.setdefault(name, np.full(rows, np.inf, np.float32))
+                        total[part] = np.minimum(total[part], parts.min(axis=-1))
+                    else:
+                        total = sums.setdefault(name, np.zeros((*value.shape[:-1], rows)))
+                        total[..., part] += parts.sum(axis=-1, dtype=np.float64)
+        shape = (len(streams), len(ids))
+        return {name: np.moveaxis(total, -1, 0).reshape(*shape, *total.shape[:-1]) for name, total in sums.items()}
 
     def _chunk(
         self,
@@ -330,7 +336,7 @@ class JitRenderer:
             return dr.opaque(mi.UInt32, value & 0xFFFFFFFF)
 
         ids, streams = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(stream.astype(np.uint32))
-        # one to one in the pixel for a given seed, so no two pixels of a scene share their numbers
+        # the first two steps are one to one in the pixel: no two pixels of a stream share their numbers
         key = mixed(mixed(mixed(ids + opaque(self.seed)) + opaque(self.seed >> 32)) + streams)
         lanes = Lanes(rays, ids, key, mi.UInt32(first.astype(np.uint32)), mi.UInt32(count.astype(np.uint32)))
         limits = self.limits
