@@ -6,8 +6,8 @@ came from. The integrator keeps its own light arrays, picks a light triangle by 
 and knows a light that a ray hits by its triangle index. Next-event estimation and BSDF sampling are combined by the
 power heuristic.
 
-One lane of the kernel traces BLOCK samples of a pixel, the next one as soon as a path ends, and keeps their sums: lanes
-of a vector stay busy, and nothing is added by atomics. The host adds a pixel's blocks in order. A sample is a function of
+One lane of the kernel traces a block of 8 to 64 samples of a pixel, the next one as soon as a path ends, and keeps their sums:
+lanes of a vector stay busy, and nothing is added by atomics. The host adds a pixel's blocks in order. A sample is a function of
 (seed, stream, view, pixel, number) only: the bytes are the same for any thread count and any chunk size.
 """
 
@@ -26,7 +26,8 @@ from stages.rendering.sobol import Sampler, mixed
 from stages.rendering.sums import Sums
 from stages.rendering.surfaces import floats, shape_mesh
 
-BLOCK = 8  # samples of a lane: also the steps in which samples can be asked for
+BLOCKS = (8, 64)  # samples of a lane, least and most
+LANES = 1 << 15  # of a view: enough to keep processors busy, so that lanes take more samples each
 GROUP = 64  # blocks of a pixel that the host adds at once
 CHUNK = 1 << 19  # lanes in flight: 40 floats of results each, about 80 MB
 RR_DEPTH = 5  # bounces before Russian roulette may end a path
@@ -268,7 +269,7 @@ class JitRenderer:
     def sample(self, views: list[int], streams: list[int], first: int, spp: int) -> list[list[Sums]]:
         """Per stream, the sums of each view over the stream's samples ``first`` to ``first + spp`` of every pixel.
 
-        Streams share no path. ``first`` is a multiple of BLOCK. A path serves all lights.
+        Streams share no path. A path serves all lights.
         """
         pixels = self.resolution * self.resolution
         ids = np.concatenate([view * pixels + np.arange(pixels) for view in views])
@@ -294,8 +295,11 @@ class JitRenderer:
         first: int,
         spp: int,
     ) -> dict[str, np.ndarray]:
-        """(streams, pixels, ..) sums over the samples, float64; ``lights`` (.., SLOTS, 3)."""
-        rows, blocks = len(streams) * len(ids), -(-spp // BLOCK)
+        """(streams, pixels, ..) sums over the samples, float64; ``lights`` (.., lights of the pass, 3)."""
+        # of resolution and samples alone, since it decides how sums are rounded
+        fitting = self.resolution**2 * spp // LANES
+        size = min(max(1 << fitting.bit_length() >> 1, BLOCKS[0]), BLOCKS[1])
+        rows, blocks = len(streams) * len(ids), -(-spp // size)
         sums: dict[str, np.ndarray] = {}
         for block in range(0, blocks, GROUP):
             depth = min(GROUP, blocks - block)
@@ -303,8 +307,8 @@ class JitRenderer:
             for start in range(0, rows, step):
                 row = np.arange(start, min(start + step, rows)).repeat(depth)
                 number_of = block + np.tile(np.arange(depth), len(row) // depth)
-                counts = np.minimum(BLOCK, spp - number_of * BLOCK)
-                where = ids[row % len(ids)], np.asarray(streams)[row // len(ids)], first + number_of * BLOCK, counts
+                counts = np.minimum(size, spp - number_of * size)
+                where = ids[row % len(ids)], np.asarray(streams)[row // len(ids)], first + number_of * size, counts
                 for name, value in self._chunk(table, number, rays, *where).items():
                     parts = value.reshape(*value.shape[:-1], -1, depth)
                     part = slice(start, start + parts.shape[-2])
@@ -354,7 +358,7 @@ class JitRenderer:
         slots, *wide, distances, hits, nearest, triangle = out
         size = len(pixel)
         return {
-            "lights": np.stack([_channels(slot, size) for slot in slots]),
+            "lights": np.stack([_channels(slot, size) for slot in slots[: table.slots]]),
             **{name: _channels(value, size) for name, value in zip(("direct", "albedo", "normal"), wide, strict=True)},
             "distance": distances.numpy(),
             "hits": hits.numpy(),
