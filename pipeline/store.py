@@ -104,12 +104,13 @@ class _Records:
         row = self.row(record_id)
         return self.part_path(row.part), row.group
 
-    def read(self, record_id: str) -> Record:
-        """One record: one open, one seek per member."""
+    def read(self, record_id: str, names: Iterable[str] | None = None) -> Record:
+        """One record, or only its members of these names: one open, one seek per member."""
         row = self.row(record_id)
         with open(self.part_path(row.part), "rb") as file:
             members = {}
-            for name, (offset, size) in row.members.items():
+            for name in row.members if names is None else names:
+                offset, size = row.members[name]
                 file.seek(offset)
                 data = file.read(size)
                 if len(data) != size:
@@ -571,3 +572,16 @@ def iter_inputs(store: Store, artifact: Artifact) -> Iterator[tuple[str, str, Ar
     """(input name, key, artifact or None if it is gone) of each input."""
     for name, key in artifact.manifest["preimage"]["inputs"].items():
         yield name, key, store.find(name, key)
+
+
+def history(inputs: Mapping[str, Artifact]) -> dict[str, dict[str, Any]]:
+    """Stage -> preimage of its key, for ``inputs`` and everything upstream of them that is still in the store."""
+    found: dict[str, dict[str, Any]] = {}
+    todo = list(inputs.values())
+    while todo:
+        artifact = todo.pop()
+        if artifact.stage not in found:
+            found[artifact.stage] = artifact.manifest["preimage"]
+            store = Store(artifact.path.parents[1])
+            todo += [parent for _, _, parent in iter_inputs(store, artifact) if parent is not None]
+    return found

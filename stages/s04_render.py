@@ -1,7 +1,7 @@
 """render: path-traced views of every scene, light by light (paper section 3.3).
 
-Reads *scene*; writes per scene ``view<i>.exr`` for every kept camera i (layers: ``stages.exr``) and ``meta.json``
-with what was noted of all cameras. One design choice: radiance is stored per light, as light transport is linear:
+Reads *scene*; writes per scene ``view<i>.exr`` and ``view<i>.aov.exr`` for every kept camera i (``stages.exr``) and
+``meta.json`` with what was noted of all cameras. One design choice: radiance is stored per light, as light transport is linear:
 the image under any other choice of intensities and colours is a weighted sum, at no rendering cost.
 
 As in the paper's data, views whose mean radiance is under 0.01 or whose nearest depth is under 0.01 are dropped.
@@ -48,7 +48,7 @@ class RenderWorker:
 
 class Render(MapStage):
     name = "render"
-    version = 2
+    version = 3
     inputs = ("scene",)
     Config = RenderConfig
     reasons = {
@@ -60,7 +60,7 @@ class Render(MapStage):
     def slug(self, config: RenderConfig) -> str:
         return f"{config.mode}-{config.resolution}px-{config.max_spp}spp"
 
-    def part_size(self, config: RenderConfig) -> int:
+    def part_size(self, config: RenderConfig, inputs: Inputs) -> int:
         return 4
 
     def environment(self, config: RenderConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
@@ -100,7 +100,9 @@ class Render(MapStage):
             reason = next(iter(statuses)) if len(statuses) == 1 else "no_view_left"
             raise Reject(reason, ", ".join(f"{count} {status}" for status, count in sorted(statuses.items())) or "no camera")
         members = {"meta.json": pack_json({"views": [view.meta for view in views]})}
-        members |= {f"view{view.meta['index']}.exr": encode_view(view) for view in views if view.meta["status"] == "ok"}
+        for view in views:
+            if view.meta["status"] == "ok":
+                members |= encode_view(view)
         yield Record(item.id, members)
 
     def finish(self, config: RenderConfig, inputs: Inputs, draft: Any) -> None:
@@ -127,14 +129,14 @@ def contact_sheet(records: list[Record]) -> Any:
     from PIL import Image
 
     from stages.arrays import unpack_json
-    from stages.exr import decode_view
+    from stages.exr import decode_lights
     from stages.tonemap import exposure_for, to_picture
 
     rows = []
     for record in records:
         views = unpack_json(record.members["meta.json"])["views"]
         names = [f"view{view['index']}.exr" for view in views]
-        images = {name: decode_view(record.members[name]).image for name in names if name in record.members}
+        images = {name: decode_lights(record.members[name])[0].sum(axis=0) for name in names if name in record.members}
         exposure = exposure_for(np.concatenate(list(images.values())))
         side = len(next(iter(images.values())))
         row = np.full((side, side * len(names), 3), 128, np.uint8)

@@ -60,7 +60,7 @@ class Evaluate(MapStage):
     def slug(self, config: EvaluateConfig) -> str:
         return config.split
 
-    def part_size(self, config: EvaluateConfig) -> int:
+    def part_size(self, config: EvaluateConfig, inputs: Inputs) -> int:
         return 4
 
     def environment(self, config: EvaluateConfig, previous: dict[str, Any] | None) -> dict[str, Any]:

@@ -15,7 +15,8 @@ import pytest
 from pipeline.config import parse
 from pipeline.errors import UserError
 from pipeline.stage import Record
-from stages.arrays import unpack_json
+from stages.arrays import pack_json, unpack_json
+from stages.dataset.encoding import encode_scene
 from stages.evaluation.baselines import best_constants, mean_images, measure_baseline
 from stages.evaluation.report import loss_curve, markdown
 from stages.evaluation.statistics import JUDGED, METHODS, bootstrap, summarise, worst_first
@@ -161,12 +162,12 @@ def shard_record(name: str, rng: np.random.Generator, cameras: list[int], lights
         light_index, np.zeros(n), np.tile(np.eye(4), (4, 1, 1)), np.full(4, 45.0), meta,
     )  # fmt: skip
     base = np.linspace(0.1, 1.2, SIZE)[:, None, None] * rng.uniform(0.3, 1, 3)
-    members = dict(made.to_record().members)
+    members = {"scene.npz": encode_scene(made), "meta.json": pack_json(meta)}
     for camera in cameras:
         layers = (base + hdr(rng, lights, SIZE, SIZE, 3) * 0.1).astype(np.float32) / lights
         flat = np.zeros((SIZE, SIZE, 3), np.float32)
         view = ViewRecord(layers, layers.sum(axis=0) * 0.6, flat, flat, flat[..., 0], flat[..., 0], {"index": camera})
-        members[f"view{camera}.exr"] = encode_view(view)
+        members |= encode_view(view)
     return Record(name, members)
 
 

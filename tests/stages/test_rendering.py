@@ -100,7 +100,7 @@ def clutter(lights=3, cameras=2):
 
 
 def hashed(views):
-    return [hashlib.sha256(encode_view(view)).hexdigest() for view in views]
+    return [hashlib.sha256(b"".join(encode_view(view).values())).hexdigest() for view in views]
 
 
 # --- against what is known --------------------------------------------------------------------------------------------
@@ -401,10 +401,10 @@ def test_stage_renders_drops_and_rejects(tmp_path):
     assert items[0] == Item("good", "train", (("scene", "good"),))
     worker = stage.open(config, inputs, SCALAR)
     (record,) = stage.process(worker, items[0])
-    assert sorted(record.members) == ["meta.json", "view0.exr"]
+    assert sorted(record.members) == ["meta.json", "view0.aov.exr", "view0.exr"]
     views = unpack_json(record.members["meta.json"])["views"]
     assert [view["status"] for view in views] == ["ok", "dark", "too_close"]
-    assert decode_view(record.members["view0.exr"]).lights.shape == (2, 16, 16, 3)
+    assert decode_view(record.members, 0).lights.shape == (2, 16, 16, 3)
     with pytest.raises(Reject) as caught:
         list(stage.process(worker, items[1]))
     assert caught.value.reason == "dark"
