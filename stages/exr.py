@@ -115,17 +115,15 @@ def encode_view(view: ViewRecord) -> dict[str, bytes]:
 
 
 def decode_lights(data: bytes, where: str = "the view") -> tuple[np.ndarray, dict]:
-    """(L, H, W, 3) float32 radiance by light, and the view's meta."""
+    """(L, H, W, 3) float32 radiance by light, and the view's meta. In memory colours are planes, as they are in the file."""
     header, channels = _decode(data, where)
     if META not in header:
         raise UserError(f"{where} has no header attribute {META!r}: it is not a view that lightmill rendered")
     meta = unpack_json(header[META])
     count = sum(name.startswith("light") and name.endswith(".R") for name in channels)
-    lights = np.empty((count, *next(iter(channels.values())).shape, 3), np.float32)
-    for i in range(count):
-        for j, letter in enumerate("RGB"):
-            lights[i, ..., j] = _channel(channels, f"light{i}.{letter}", where)
-    return lights, meta
+    names = [f"light{i}.{letter}" for i in range(count) for letter in "RGB"]
+    planes = _planes(channels, names, where).reshape(count, 3, *next(iter(channels.values())).shape)
+    return np.moveaxis(planes, 1, -1), meta
 
 
 def decode_layers(data: bytes, where: str = "the view") -> dict[str, np.ndarray]:
@@ -134,18 +132,21 @@ def decode_layers(data: bytes, where: str = "the view") -> dict[str, np.ndarray]
     layers = {}
     for name in sorted({name.partition(".")[0] for name in channels} & LAYERS.keys()):
         letters, dtype = LAYERS[name]
-        planes = [_channel(channels, f"{name}.{letter}", where) for letter in letters]
-        if dtype is np.uint32:
-            layers[name] = planes[0].astype(np.int32) - 1
-        else:
-            layers[name] = np.stack(planes, axis=-1, dtype=np.float32) if len(letters) > 1 else planes[0].astype(np.float32)
+        planes = _planes(
+            channels, [f"{name}.{letter}" for letter in letters], where, np.int32 if dtype is np.uint32 else np.float32
+        )
+        layers[name] = planes[0] - 1 if dtype is np.uint32 else np.moveaxis(planes, 0, -1) if len(letters) > 1 else planes[0]
     return layers
 
 
-def _channel(channels: Mapping[str, np.ndarray], name: str, where: str) -> np.ndarray:
-    if name not in channels:
-        raise UserError(f"{where} has no channel {name}: it is not a view that lightmill rendered")
-    return channels[name]
+def _planes(channels: Mapping[str, np.ndarray], names: list[str], where: str, dtype: type = np.float32) -> np.ndarray:
+    """(len(names), H, W): the file's own order, which costs no shuffling of pixels."""
+    planes = np.empty((len(names), *next(iter(channels.values())).shape), dtype)
+    for plane, name in zip(planes, names, strict=True):
+        if name not in channels:
+            raise UserError(f"{where} has no channel {name}: it is not a view that lightmill rendered")
+        plane[...] = channels[name]
+    return planes
 
 
 def decode_view(members: Mapping[str, bytes], index: int, where: str = "the view") -> ViewRecord:

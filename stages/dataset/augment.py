@@ -57,12 +57,11 @@ def make_example(sample: Sample, views: np.ndarray, factors: np.ndarray | None, 
         example |= {name: getattr(scene, name) for name in ("patch_index", PATCHES)}
     seen = [sample.views[int(view)] for view in views]
     weights = np.ones((scene.n_lights, 3), np.float32) if factors is None else factors.astype(np.float32)
-    example["image"] = np.zeros((len(seen), *seen[0].lights.shape[1:]), np.float32)
-    for image, view in zip(example["image"], seen, strict=True):
-        add_lights(image, view.lights, weights)
-    for name in layers:
-        if name != "direct" or factors is None:
-            example[name] = np.stack([getattr(view, name) for view in seen])
+    if seen:
+        example["image"] = np.stack([lit_by(view.lights, weights) for view in seen])
+        for name in layers:
+            if name != "direct" or factors is None:
+                example[name] = np.stack([getattr(view, name) for view in seen])
     if factors is not None:
         lit = scene.light_index >= 0
         example["emission"] = scene.emission.copy()
@@ -70,12 +69,14 @@ def make_example(sample: Sample, views: np.ndarray, factors: np.ndarray | None, 
     return example
 
 
-def add_lights(image: np.ndarray, lights: np.ndarray, weights: np.ndarray) -> None:
-    """Add lights (L, H, W, 3) weighted by (L, 3) to an image (H, W, 3), one after the other: the same bits everywhere."""
+def lit_by(lights: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(H, W, 3): lights (L, H, W, 3) weighted by (L, 3) and added one after the other, the same bits everywhere."""
+    image = np.zeros_like(lights[0]) if len(lights) else np.zeros(lights.shape[1:], np.float32)
     scaled = np.empty_like(image)
     for light, weight in zip(lights, weights, strict=True):
         if weight.any():
             image += light if (weight == 1).all() else np.multiply(light, weight, out=scaled)
+    return image
 
 
 def expose(example: Batch, factor: float) -> Batch:
@@ -98,7 +99,8 @@ def move(example: Batch, rotation: np.ndarray, translation: np.ndarray) -> Batch
     """The example rigidly moved; what the cameras see stays the same, but for normals, which are in world space."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    turned = {name: (example[name] @ rotation.T).astype(np.float32) for name in ("vertex_normals", "normal") if name in example}
+    turn = rotation.T.astype(np.float32)
+    turned = {name: example[name] @ turn for name in ("vertex_normals", "normal") if name in example}
     return {
         **example,
         **turned,

@@ -102,11 +102,10 @@ def encode_scene(scene: SceneRecord) -> bytes:
 def decode_scene(id: str, scene: bytes, meta: bytes) -> SceneRecord:
     """A scene from the members ``scene.npz`` and ``meta.json`` of a shard's sample; UserError if they do not fit together."""
     try:
-        with zipfile.ZipFile(io.BytesIO(scene)) as archive:
-            claimed = sum(entry.file_size for entry in archive.infolist())
-        if claimed > MAX_BYTES:
-            raise UserError(f"scene {id}: its arrays claim {claimed:,} bytes, more than {MAX_BYTES:,}")
         with np.load(io.BytesIO(scene), allow_pickle=False) as file:
+            claimed = sum(entry.file_size for entry in file.zip.infolist())
+            if claimed > MAX_BYTES:
+                raise UserError(f"scene {id}: its arrays claim {claimed:,} bytes, more than {MAX_BYTES:,}")
             a = {name: file[name] for name in file.files}
         vertices = a["vertices"] * a["scale"] + a["origin"]
         normals = a["normals"] / np.float32(UNIT)

@@ -43,7 +43,7 @@ class BatchConfig(Section):
 
     seed: int = 0
     batch_scenes: int = Field(4, ge=1)  # over all ranks
-    views_per_scene: int = Field(2, ge=1)
+    views_per_scene: int = Field(2, ge=0)  # 0: no images
     rotate: bool = True  # rotation vector ~ N(0, I)
     translate_sigma: float = Field(0.25, ge=0)  # scene units, translation ~ N(0, sigma^2 I)
     mirror: bool = False  # x -> -x, for half of the samples
@@ -114,7 +114,7 @@ class Batches:
     def _augmented(self, index: int, epoch: int) -> Batch:
         config, id = self.config, self.dataset.ids[index]
         rng = np.random.default_rng(seed_for(config.seed, "augment", f"{epoch}/{id}"))
-        kept, wanted = np.array(self.dataset.views(index)), config.views_per_scene
+        kept, wanted = np.array(self.dataset.row(index)["views"]), config.views_per_scene
         views = rng.choice(kept, size=wanted, replace=wanted > len(kept))
         sample = self.dataset.read(index, views, config.layers)
         factors = draw_light_factors(config.lighting, rng, sample.scene.n_lights) if config.relight else None

@@ -175,13 +175,13 @@ class ShardDataset:
         skip_damaged_shards: bool = False,
     ):
         self.split = split
-        self._source = open_source(source, cache_folder)
+        self.source = open_source(source, cache_folder)
         self._skip = skip_damaged_shards
         self._rows: list[bytes] = []  # index lines, parsed again where needed: a tenth of the memory of parsed ones
         self.ids: list[str] = []
         triangles, splits, self.dropped, self.resolution = [], set(), 0, 0
         shards: set[str] = set()
-        with open(self._source.path(f"files/{INDEX}"), "rb") as file:
+        with open(self.source.path(f"files/{INDEX}"), "rb") as file:
             for line in file:
                 row = json.loads(line)
                 splits.add(row["split"])
@@ -218,15 +218,15 @@ class ShardDataset:
         """The sample whole: every view with every layer."""
         return self.read(index, layers=("all",))
 
-    def views(self, index: int) -> list[int]:
-        """Camera indices of a sample's kept views, from the index alone."""
-        return json.loads(self._rows[index])["views"]
+    def row(self, index: int) -> dict[str, Any]:
+        """A sample's line of the index: its views, shard, members and more."""
+        return json.loads(self._rows[index])
 
     def read(self, index: int, views: Sequence[int] | None = None, layers: Sequence[str] = ()) -> Sample:
         """The sample with these views (None: all), their lights, and their AOVs if any ``layers`` are wanted."""
-        row = json.loads(self._rows[index])
+        row = self.row(index)
         wanted = row["views"] if views is None else sorted({int(view) for view in views})
-        with _Reader(self, row) as reader:
+        with Reader(self, row) as reader:
             scene = self._cached(
                 (index, "scene"),
                 lambda: decode_scene(row["id"], reader["scene.npz"], reader["meta.json"]),
@@ -266,15 +266,15 @@ class ShardDataset:
     def _shard_sizes(self, shards: set[str]) -> dict[str, int]:
         """Bytes of each shard; those on this disk are compared with what is there."""
         sizes = {}
-        for split in json.loads(self._source.path(f"files/{SHARDS}").read_bytes()).values():
+        for split in json.loads(self.source.path(f"files/{SHARDS}").read_bytes()).values():
             for part in split["parts"]:
                 if part["path"] in shards:
                     sizes[part["path"]] = part["bytes"]
         for name in sorted(shards):
             if not SHARD.match(name) or name not in sizes:
                 raise UserError(f"the index names a shard {name!r} that {SHARDS} does not hold")
-            if isinstance(self._source, Folder) and not self._skip:
-                self._check(name, self._source.shard(name), sizes[name])
+            if isinstance(self.source, Folder) and not self._skip:
+                self._check(name, self.source.shard(name), sizes[name])
         return sizes
 
     def _check(self, name: str, path: Path, size: int) -> None:
@@ -287,13 +287,13 @@ class ShardDataset:
             )
 
 
-class _Reader:
+class Reader:
     """The members of one sample: one open, a seek each, CRC checked."""
 
     def __init__(self, dataset: ShardDataset, row: dict[str, Any]):
         self._dataset, self._row, self._file = dataset, row, None
 
-    def __enter__(self) -> _Reader:
+    def __enter__(self) -> Reader:
         return self
 
     def __exit__(self, *_: Any) -> None:
@@ -318,7 +318,7 @@ class _Reader:
     def _open(self) -> Any:
         name = self._row["shard"]
         try:
-            path = self._dataset._source.shard(name)
+            path = self._dataset.source.shard(name)
             self._dataset._check(name, path, self._dataset._sizes[name])
             return open(path, "rb")  # noqa: SIM115 - closed with the reader
         except (UserError, OSError) as error:
@@ -331,8 +331,7 @@ class _Reader:
 def _nbytes(value: Any) -> int:
     if isinstance(value, np.ndarray):
         return value.nbytes
-    if isinstance(value, SceneRecord | ViewRecord):
-        return _nbytes(list(vars(value).values()))
-    if isinstance(value, dict):
-        return _nbytes(list(value.values()))
-    return sum(map(_nbytes, value)) if isinstance(value, list | tuple) else 0
+    if isinstance(value, SceneRecord):
+        value = vars(value)
+    parts = value.values() if isinstance(value, dict) else value
+    return sum(part.nbytes for part in parts if isinstance(part, np.ndarray))

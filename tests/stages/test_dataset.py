@@ -300,7 +300,7 @@ for batch in loader:
 
 def test_killed_at_a_random_step_it_goes_on_with_the_very_next_batch(many, tmp_path):
     kill = int(np.random.default_rng().integers(1, 12))
-    root = many._source.root
+    root = many.source.root
 
     def run(name: str, workers: int, kill: int) -> list[str]:
         command = [sys.executable, "-c", RUN, str(root), str(tmp_path / name), str(workers), str(kill)]
@@ -329,7 +329,7 @@ def test_state_belongs_to_one_sequence(many):
 @pytest.fixture
 def copy(many, tmp_path):
     """A copy of the dataset's folder that a test may damage, and the lines of its index."""
-    shutil.copytree(many._source.root, tmp_path / "copy")
+    shutil.copytree(many.source.root, tmp_path / "copy")
     lines = (tmp_path / "copy" / "files" / "index.jsonl").read_text().splitlines()
     return tmp_path / "copy", [row for row in map(json.loads, lines) if row["split"] == "train"]
 
@@ -419,7 +419,7 @@ def test_an_index_that_lies_is_refused(copy):
 @pytest.mark.parametrize("form", ["file:{root}", "pipe:cat {root}/{{}}"])
 def test_a_dataset_behind_a_url_is_fetched_once_and_then_local(many, tmp_path, form):
     pytest.importorskip("webdataset")
-    url = form.format(root=many._source.root)
+    url = form.format(root=many.source.root)
     remote = ShardDataset(url, "train", cache_folder=tmp_path)
     assert not list(tmp_path.rglob("*.tar"))
     assert all(
