@@ -234,7 +234,7 @@ CODES: dict[str, dict[str, Callable[[np.ndarray], np.ndarray]]] = {
 
 
 def precision(scenes: list[SceneRecord], checkpoints: list[Path]) -> None:
-    """What each dtype moves: corners in pixels at 512 px, and the networks' outputs in log10(1 + radiance)."""
+    """What each dtype moves: corners in pixels at 512 px, and the networks' outputs, as shares of their own spread."""
     from dataclasses import replace
 
     import torch
@@ -252,15 +252,20 @@ def precision(scenes: list[SceneRecord], checkpoints: list[Path]) -> None:
     def seen(model: object, scene: SceneRecord) -> np.ndarray:
         return log_encode(predict_scene(model, scene, [0, 1], 64))
 
-    models = {folder.name: load_model(folder) for folder in checkpoints}
-    print(f"precision ({len(scenes)} scenes; largest corner shift in pixels of 512; mean and largest change of log10(1 + x))")
+    models = {
+        (folder.parents[1].name if folder.name == "checkpoint" else folder.name): load_model(folder) for folder in checkpoints
+    }
+    print(
+        f"precision ({len(scenes)} scenes; largest corner shift in pixels of 512; mean and largest change of the output "
+        "log10(1 + x), over its standard deviation)"
+    )
     print(f"  {'':58s} {'pixels':>8s}  " + "  ".join(f"{name:>19s}" for name in models))
     exact = {name: [seen(model, scene) for scene in scenes] for name, model in models.items()}
 
     def line(label: str, shift: float, changes: dict[str, list[np.ndarray]]) -> None:
         cells = []
-        for diffs in changes.values():
-            flat = np.concatenate([d.reshape(-1) for d in diffs])
+        for name, diffs in changes.items():
+            flat = np.concatenate([d.reshape(-1) for d in diffs]) / np.std(exact[name])
             cells.append(f"{flat.mean():9.2e} {flat.max():9.2e}")
         print(f"  {label:58s} {shift:8.4f}  " + "  ".join(cells), flush=True)
 

@@ -175,7 +175,8 @@ def plot_distributions(drawn: Mapping[str, Mapping[str, np.ndarray]], path: Path
         elif high <= low * (1 + 1e-6) or high == low:
             edges = np.array([low * 0.9 - 1e-3, high * 1.1 + 1e-3])
         else:
-            edges = np.geomspace(low, high, 31) if scale == "log" else np.linspace(low, high, 31)
+            bins = int(np.clip(2 * len(every) ** 0.5, 8, 40))
+            edges = (np.geomspace if scale == "log" else np.linspace)(low, high, bins + 1)
         for (split, mine), color in zip(sorted(values.items(), key=lambda item: ORDER.get(item[0], 9)), COLORS, strict=False):
             shares = np.histogram(mine, edges)[0] / len(mine)
             style = {"fill": True, "alpha": 0.35} if split == "train" else {"linewidth": 1.5}
@@ -305,13 +306,13 @@ def sections(
         known.update((str(o["licence"] or "unknown"), source_of(o["source"])) for o in ids.values())
     origins.blocks.append(("table", ("licence", "source", "objects"), [(*pair, f"{n:,}") for pair, n in sorted(known.items())]))
     listed = [
-        (split, id, o["family"] or "", o["origin"] or "", o["licence"] or "unknown", o["scenes"])
+        (split, id, o["source"] or "", o["origin"] or "", o["licence"] or "unknown", o["scenes"])
         for split in splits
         for id, o in sorted(objects.get(split, {}).items())
     ]
     if len(listed) > LISTED:
         origins.blocks.append(("text", f"The first {LISTED:,} of {len(listed):,}; `objects.json` names all."))
-    origins.blocks.append(("table", ("split", "object", "family", "origin", "licence", "scenes"), listed[:LISTED]))
+    origins.blocks.append(("table", ("split", "object", "source", "origin", "licence", "scenes"), listed[:LISTED]))
 
     made = Section("How it was made")
     made.blocks.append(("text", f"The key {key} is the hash of stage, version, parameters and the keys of its inputs."))
@@ -347,8 +348,9 @@ def ranges(drawn: Mapping[str, Mapping[str, np.ndarray]]) -> list[tuple[str, ...
 
 
 def source_of(source: str | None) -> str:
-    """Where an object came from, without its name in there."""
-    return (source or "unknown").partition("/")[0] if (source or "").startswith("objaverse") else (source or "unknown")
+    """The kind of an object's source: procedural, objaverse, or files (of a folder), whose paths are in objects.json."""
+    kind = (source or "unknown").partition("/")[0]
+    return kind if kind in ("procedural", "objaverse", "unknown") else "files"
 
 
 def inputs_of(preimage: Mapping[str, Any]) -> str:

@@ -26,8 +26,8 @@ import io, numpy as np
 
 def read_scene(data: bytes) -> dict:
     a = dict(np.load(io.BytesIO(data)))
-    vertices = a["vertices"] * a["scale"] + a["origin"]                      # (P, 3) float32
-    normals = a["normals"] / np.float32(32767)                              # (N, 3)
+    vertices = a["vertices"] * a["scale"] + a["origin"]  # (P, 3) float32
+    normals = a["normals"] / np.float32(32767)  # (N, 3)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.float32(1e-12))
     scene = {"triangles": vertices[a["faces"]], "vertex_normals": normals[a["face_normals"]]}
     scene |= {k: a[k].astype(np.float32)[a["material"]] for k in ("diffuse", "specular", "roughness")}

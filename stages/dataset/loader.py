@@ -7,10 +7,10 @@ decide who computes a step. So to resume is to remember one number.
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import os
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -51,6 +51,7 @@ class BatchConfig(Section):
     relight: bool = False
     lighting: Relight = Relight()  # what relight draws from
     layers: tuple[str, ...] = ()  # AOV layers that a batch holds besides the image; only then are they read
+    shuffle_shards: int = Field(0, ge=0)  # scenes are shuffled over this many shards at a time; 0: over the whole split
     bucket: int = Field(0, ge=0)  # global batches whose scenes are sorted by triangle count together; 0: none
     pad_multiple: int = Field(1, ge=1)  # the padded number of triangles is a multiple of it: few shapes for compilers
 
@@ -64,6 +65,15 @@ class Batches:
                 f"batch_scenes={config.batch_scenes} cannot be shared by {world} processes: make it a multiple of {world}"
             )
         self.dataset, self.config, self.rank, self.world = dataset, config, rank, world
+        self._orders: dict[int, np.ndarray] = {}
+        self._lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_orders": {}, "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._lock = threading.Lock()
 
     def __call__(self, step: int) -> Batch:
         share = self.config.batch_scenes // self.world
@@ -75,10 +85,34 @@ class Batches:
     def order(self, epoch: int) -> np.ndarray:
         """(len(dataset),) indices in the order of that epoch: each exactly once.
 
+        With ``shuffle_shards`` the shards are shuffled and their scenes mixed only within windows of that many of them, so that
+        few shards are in use at a time: for disks that hate seeks, and splits that are fetched and do not fit.
+
         With buckets, scenes are shuffled first and sorted only inside pools of ``bucket`` global batches, and a pool's batches
         are shuffled again: what a batch holds changes with every epoch, its mean size carries no order.
         """
-        return _order(self.dataset.triangles.tobytes(), self.config.seed, self.config.bucket, self.config.batch_scenes, epoch)
+        with self._lock:
+            if epoch not in self._orders:
+                self._orders = {**dict(list(self._orders.items())[-3:]), epoch: self._draw_order(epoch)}
+            return self._orders[epoch]
+
+    def _draw_order(self, epoch: int) -> np.ndarray:
+        config, counts, shards = self.config, self.dataset.triangles, self.dataset.shard_of
+        rng = np.random.default_rng(seed_for(config.seed, "epoch", str(epoch)))
+        order = rng.permutation(len(counts))
+        if config.shuffle_shards:  # by windows of shards; stable, so that scenes stay shuffled within a window
+            window = np.argsort(rng.permutation(shards.max() + 1)) // config.shuffle_shards
+            order = order[np.argsort(window[shards[order]], kind="stable")]
+        if config.bucket:
+            batch = config.batch_scenes
+            start = -epoch * len(counts) % batch  # the last batch of the epoch before takes its rest from this one's head
+            for first in range(start, len(order), config.bucket * batch):
+                pool = order[first : first + config.bucket * batch]
+                pool = pool[np.argsort(counts[pool], kind="stable")]
+                whole = len(pool) // batch * batch
+                shuffled = rng.permutation(pool[:whole].reshape(-1, batch), axis=0).reshape(-1)
+                order[first : first + len(pool)] = np.concatenate([shuffled, pool[whole:]])
+        return order
 
     def padding_waste(self, first_step: int, steps: int) -> float:
         """Share of padded triangles in those global batches, all ranks together, from the index alone."""
@@ -127,23 +161,6 @@ class Batches:
         if config.exposure_stops:
             example = expose(example, 2.0 ** rng.uniform(-config.exposure_stops, config.exposure_stops))
         return example
-
-
-@functools.lru_cache(maxsize=4)
-def _order(triangles: bytes, seed: int, bucket: int, batch: int, epoch: int) -> np.ndarray:
-    counts = np.frombuffer(triangles, np.int64)
-    rng = np.random.default_rng(seed_for(seed, "epoch", str(epoch)))
-    order = rng.permutation(len(counts))
-    if bucket:
-        start = -epoch * len(counts) % batch  # the last batch of the epoch before takes its rest from this one's head
-        for first in range(start, len(order), bucket * batch):
-            pool = order[first : first + bucket * batch]
-            pool = pool[np.argsort(counts[pool], kind="stable")]
-            whole = len(pool) // batch * batch
-            shuffled = rng.permutation(pool[:whole].reshape(-1, batch), axis=0).reshape(-1)
-            order[first : first + len(pool)] = np.concatenate([shuffled, pool[whole:]])
-    order.flags.writeable = False
-    return order
 
 
 def evaluation_samples(dataset: ShardDataset) -> Iterator[Batch]:

@@ -101,9 +101,16 @@ class Remote:
     ``root`` may hold ``{}`` for the file's path (``pipe:curl -sf https://host/data/{}``), else the path is appended.
     """
 
-    def __init__(self, root: str, cache: Path):
-        self.root = root
+    def __init__(self, root: str, cache: Path, gigabytes: float | None = None):
+        self.root, self.limit = root, None if gigabytes is None else gigabytes * 1e9
         self.cache = cache / hashlib.blake2b(root.encode(), digest_size=16).hexdigest()
+        self._lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
         self._lock = threading.Lock()
 
     def url(self, name: str) -> str:
@@ -117,7 +124,21 @@ class Remote:
         return target
 
     def shard(self, name: str) -> Path:
-        return self.path(name)
+        path = self.path(name)
+        if self.limit is not None:
+            os.utime(path)
+            self._make_room(path)
+        return path
+
+    def _make_room(self, keep: Path) -> None:
+        """Drop the shards that were not used for longest; readers that have one open are not disturbed."""
+        with self._lock:
+            found = [(path, path.stat()) for path in keep.parent.glob("*.tar")]
+            total = sum(stat.st_size for _, stat in found)
+            for path, stat in sorted(found, key=lambda item: item[1].st_mtime_ns):
+                if total > self.limit and path != keep:
+                    path.unlink(missing_ok=True)
+                    total -= stat.st_size
 
     def _fetch(self, name: str, target: Path) -> None:
         from webdataset.gopen import gopen
@@ -142,12 +163,12 @@ class Remote:
             Path(temporary).unlink(missing_ok=True)
 
 
-def open_source(source: Any, cache_folder: Path | str | None = None) -> Folder | Remote:
-    """``source``: an artifact, a folder, or a URL."""
+def open_source(source: Any, cache_folder: Path | str | None = None, cache_gb: float | None = None) -> Folder | Remote:
+    """``source``: an artifact, a folder, or a URL, whose shards are kept in ``cache_folder``, at most ``cache_gb`` of them."""
     root = getattr(source, "path", source)
     if isinstance(root, str) and REMOTE.match(root):
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        return Remote(root, Path(cache_folder) if cache_folder else home / "lightmill")
+        return Remote(root, Path(cache_folder) if cache_folder else home / "lightmill", cache_gb)
     root = Path(root)
     if not (root / "files" / INDEX).is_file():
         raise UserError(f"{root} is not a dataset: it has no files/{INDEX} (give a shard artifact's folder, or a URL)")
@@ -160,8 +181,9 @@ def open_source(source: Any, cache_folder: Path | str | None = None) -> Folder |
 class ShardDataset:
     """Random access to the samples of one split, with a bounded cache of decoded members. Safe to use from threads.
 
-    ``ids`` in the shards' order, ``triangles`` (len,) their counts, ``resolution`` in pixels, ``dropped`` the number of
-    scenes over ``max_triangles``: known from the index, without reading a sample.
+    ``ids`` in the shards' order, ``triangles`` (len,) their counts, ``shard_of`` (len,) the number of each one's shard,
+    ``resolution`` in pixels, ``dropped`` the number of scenes over ``max_triangles``: known from the index, without reading a
+    sample.
     """
 
     def __init__(
@@ -172,15 +194,16 @@ class ShardDataset:
         cache_mb: float = 1024.0,
         *,
         cache_folder: Path | str | None = None,
+        cache_gb: float | None = None,
         skip_damaged_shards: bool = False,
     ):
         self.split = split
-        self.source = open_source(source, cache_folder)
+        self.source = open_source(source, cache_folder, cache_gb)
         self._skip = skip_damaged_shards
         self._rows: list[bytes] = []  # index lines, parsed again where needed: a tenth of the memory of parsed ones
         self.ids: list[str] = []
-        triangles, splits, self.dropped, self.resolution = [], set(), 0, 0
-        shards: set[str] = set()
+        triangles, shard_of, splits, self.dropped, self.resolution = [], [], set(), 0, 0
+        shards: dict[str, int] = {}
         with open(self.source.path(f"files/{INDEX}"), "rb") as file:
             for line in file:
                 row = json.loads(line)
@@ -193,12 +216,12 @@ class ShardDataset:
                 self._rows.append(line)
                 self.ids.append(row["id"])
                 triangles.append(row["triangles"])
-                shards.add(row["shard"])
+                shard_of.append(shards.setdefault(row["shard"], len(shards)))
                 self.resolution = row["resolution"]
         if not self.ids:
             over = f" with at most {max_triangles} triangles" if self.dropped else ""
             raise UserError(f"the dataset has no {split} scenes{over}: its splits are {', '.join(sorted(splits)) or 'empty'}")
-        self.triangles = np.array(triangles)
+        self.triangles, self.shard_of = np.array(triangles), np.array(shard_of)
         self._sizes = self._shard_sizes(shards)
         self.cache_bytes = int(cache_mb * 1e6)
         self._cache: OrderedDict[tuple[int, str], tuple[Any, int]] = OrderedDict()
@@ -263,7 +286,7 @@ class ShardDataset:
                     self._used -= self._cache.popitem(last=False)[1][1]
         return value
 
-    def _shard_sizes(self, shards: set[str]) -> dict[str, int]:
+    def _shard_sizes(self, shards: Mapping[str, int]) -> dict[str, int]:
         """Bytes of each shard; those on this disk are compared with what is there."""
         sizes = {}
         for split in json.loads(self.source.path(f"files/{SHARDS}").read_bytes()).values():

@@ -236,9 +236,9 @@ def many(tmp_path_factory):
     return ShardDataset(sharded(tmp_path_factory.mktemp("many"), train=13, test=1, size=8)[1], "train")
 
 
-@pytest.mark.parametrize("bucket", [0, 1, 3])
-def test_every_epoch_visits_every_scene_once_whatever_the_buckets(many, bucket):
-    batches = Batches(many, BatchConfig(batch_scenes=4, bucket=bucket))
+@pytest.mark.parametrize(("bucket", "shuffle_shards"), [(0, 0), (1, 0), (3, 0), (0, 2), (3, 2)])
+def test_every_epoch_visits_every_scene_once_whatever_the_buckets(many, bucket, shuffle_shards):
+    batches = Batches(many, BatchConfig(batch_scenes=4, bucket=bucket, shuffle_shards=shuffle_shards))
     sequence = [id for step in range(13) for id in batches(step)["ids"]]
     for epoch in range(4):
         assert sorted(sequence[epoch * 13 : epoch * 13 + 13]) == sorted(many.ids)
@@ -430,6 +430,23 @@ def test_a_dataset_behind_a_url_is_fetched_once_and_then_local(many, tmp_path, f
     before = [path.stat().st_mtime_ns for path in kept]
     assert len(list(prefetch(Batches(ShardDataset(url, "train", cache_folder=tmp_path), PLAIN), 0, 4, workers=2))) == 4
     assert [path.stat().st_mtime_ns for path in kept] == before
+
+
+def test_few_shards_are_in_use_at_a_time(many, tmp_path):
+    """A split that does not fit the local disk: shards come and go, and every scene is still visited once."""
+    pytest.importorskip("webdataset")
+    config = BatchConfig(batch_scenes=4, shuffle_shards=1, bucket=1)
+    batches = Batches(many, config)
+    for epoch in range(3):
+        order = batches.order(epoch)
+        assert sorted(order) == list(range(13))
+        assert sum(np.diff(many.shard_of[order]) != 0) <= 3 + 2 * 4  # four shards, mixed where a batch spans two
+    assert many.shard_of.tolist() == [0] * 4 + [1] * 4 + [2] * 4 + [3]
+    largest = max(many._sizes.values())
+    remote = ShardDataset(f"file:{many.source.root}", "train", cache_mb=0, cache_folder=tmp_path, cache_gb=2.5 * largest / 1e9)
+    for step in range(7):
+        assert same(Batches(remote, config)(step), batches(step))
+        assert sum(path.stat().st_size for path in tmp_path.rglob("*.tar")) <= 2.5 * largest
 
 
 def test_what_arrives_damaged_is_refused(copy, tmp_path):

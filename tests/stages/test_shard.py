@@ -137,7 +137,7 @@ def test_card_tells_what_is_there_and_its_reader_works(made):
     """Ten lines of numpy, copied out of the card, give the arrays that the loader gives."""
     _, artifact = made
     card, page = artifact.file("README.md").read_text(), artifact.file("card.html").read_text()
-    assert "| train | 6 | 18 |" in card and "| CC0 | test |" in card and artifact.key in card
+    assert "| train | 6 | 18 |" in card and "| CC0 | files |" in card and artifact.key in card
     assert "https://example.org/train-blob" in card and '"shard_mb": 256' in card
     assert page.count("data:image/png;base64,") == 2 and "<script" not in page and "http" not in page.split("<h2")[0]
     for name in artifact.read(artifact.ids()[0]).members:
