@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.store import Artifact, Store, iter_inputs
 from stages.dataset import BatchConfig, Batches, Relight, ShardDataset, prefetch
 from stages.dataset.encoding import decode_scene
 from stages.dataset.shards import Reader
@@ -306,7 +307,12 @@ def main() -> None:
         exr_table(dataset)
     if "precision" in what:
         chosen = np.unique(np.linspace(0, len(dataset) - 1, 4).round().astype(int))
-        precision([dataset.read(int(index), []).scene for index in chosen], arguments.checkpoints)
+        artifact = Artifact(arguments.dataset.absolute())
+        found = {name: parent for name, _, parent in iter_inputs(Store(artifact.path.parents[1]), artifact)}
+        if found.get("scene") is None:
+            raise SystemExit("precision needs the scenes before encoding: DATASET in a store that still holds them")
+        scenes = [SceneRecord.from_record(found["scene"].read(dataset.ids[index])) for index in chosen]
+        precision(scenes, arguments.checkpoints)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.config import Section
+from pipeline.errors import UserError
 from stages.dataset.shards import Sample
 
 Batch = dict[str, Any]
@@ -61,6 +62,8 @@ def make_example(sample: Sample, views: np.ndarray, factors: np.ndarray | None, 
         example["image"] = np.stack([lit_by(view.lights, weights) for view in seen])
         for name in layers:
             if name != "direct" or factors is None:
+                if any(getattr(view, name, None) is None for view in seen):
+                    raise UserError(f"views of scene {scene.id} have no layer {name!r}: they were rendered without it")
                 example[name] = np.stack([getattr(view, name) for view in seen])
     if factors is not None:
         lit = scene.light_index >= 0

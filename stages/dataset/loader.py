@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pipeline.config import Section
 from pipeline.errors import UserError
@@ -34,6 +34,7 @@ from stages.dataset.augment import (
     rotation_from_vector,
 )
 from stages.dataset.shards import DamagedSample, ShardDataset
+from stages.exr import LAYERS
 
 MOST_DAMAGED = 64  # samples in a row that cannot be read before it is the dataset that is damaged
 
@@ -54,6 +55,13 @@ class BatchConfig(Section):
     shuffle_shards: int = Field(0, ge=0)  # scenes are shuffled over this many shards at a time; 0: over the whole split
     bucket: int = Field(0, ge=0)  # global batches whose scenes are sorted by triangle count together; 0: none
     pad_multiple: int = Field(1, ge=1)  # the padded number of triangles is a multiple of it: few shapes for compilers
+
+    @field_validator("layers")
+    @classmethod
+    def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if unknown := set(names) - LAYERS.keys():
+            raise ValueError(f"layers {', '.join(sorted(unknown))} are unknown: choose from {', '.join(LAYERS)}")
+        return names
 
 
 class Batches:
@@ -146,9 +154,9 @@ class Batches:
         raise UserError(f"{len(damaged)} samples in a row cannot be read, the last because {list(damaged.values())[-1]}")
 
     def _augmented(self, index: int, epoch: int) -> Batch:
-        config, id = self.config, self.dataset.ids[index]
-        rng = np.random.default_rng(seed_for(config.seed, "augment", f"{epoch}/{id}"))
-        kept, wanted = np.array(self.dataset.row(index)["views"]), config.views_per_scene
+        config, row = self.config, self.dataset.row(index)
+        rng = np.random.default_rng(seed_for(config.seed, "augment", f"{epoch}/{row['id']}"))
+        kept, wanted = np.array(row["views"]), config.views_per_scene
         views = rng.choice(kept, size=wanted, replace=wanted > len(kept))
         sample = self.dataset.read(index, views, config.layers)
         factors = draw_light_factors(config.lighting, rng, sample.scene.n_lights) if config.relight else None

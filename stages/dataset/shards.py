@@ -55,13 +55,9 @@ class Sample:
     views: dict[int, ViewRecord]  # camera index -> what it saw
 
 
-def decode_view_parts(lights: bytes, aov: bytes | None, where: str) -> ViewRecord:
-    """A view from its first member, and its AOV layers (else None) from the second."""
-    radiance, meta = decode_lights(lights, where)
-    layers: dict[str, Any] = dict.fromkeys(VIEW_FIELDS - {"lights", "meta"})
-    if aov is not None:
-        layers |= {name: pixels for name, pixels in decode_layers(aov, where).items() if name in VIEW_FIELDS}
-    return ViewRecord(radiance, **layers, meta=meta)
+def _view(lights: np.ndarray, meta: dict[str, Any], layers: Mapping[str, np.ndarray]) -> ViewRecord:
+    """A view from its decoded members; layers that are not there are None."""
+    return ViewRecord(lights, **{name: layers.get(name) for name in VIEW_FIELDS - {"lights", "meta"}}, meta=meta)
 
 
 def decode_members(id: str, members: Mapping[str, bytes]) -> Sample:
@@ -70,7 +66,8 @@ def decode_members(id: str, members: Mapping[str, bytes]) -> Sample:
     views = {}
     for index in scene.meta["views"]:
         image, aov = view_members(index)
-        views[index] = decode_view_parts(members[image], members[aov], f"{image} of {id}")
+        where = f"{image} of {id}"
+        views[index] = _view(*decode_lights(members[image], where), decode_layers(members[aov], where))
     return Sample(scene, views)
 
 
@@ -200,27 +197,37 @@ class ShardDataset:
         self.split = split
         self.source = open_source(source, cache_folder, cache_gb)
         self._skip = skip_damaged_shards
-        self._rows: list[bytes] = []  # index lines, parsed again where needed: a tenth of the memory of parsed ones
         self.ids: list[str] = []
         triangles, shard_of, splits, self.dropped, self.resolution = [], [], set(), 0, 0
         shards: dict[str, int] = {}
+        lines: list[bytes] = []
         with open(self.source.path(f"files/{INDEX}"), "rb") as file:
-            for line in file:
-                row = json.loads(line)
-                splits.add(row["split"])
-                if row["split"] != split:
+            for number, line in enumerate(file, 1):
+                try:
+                    row = json.loads(line)
+                    id, group, count, shard, resolution = (
+                        row[name] for name in ("id", "split", "triangles", "shard", "resolution")
+                    )
+                except (ValueError, KeyError, TypeError) as error:
+                    raise UserError(
+                        f"line {number} of {file.name} is no line of an index ({error!r}): fetch it again"
+                    ) from error
+                splits.add(group)
+                if group != split:
                     continue
-                if max_triangles is not None and row["triangles"] > max_triangles:
+                if max_triangles is not None and count > max_triangles:
                     self.dropped += 1
                     continue
-                self._rows.append(line)
-                self.ids.append(row["id"])
-                triangles.append(row["triangles"])
-                shard_of.append(shards.setdefault(row["shard"], len(shards)))
-                self.resolution = row["resolution"]
+                lines.append(line)
+                self.ids.append(id)
+                triangles.append(count)
+                shard_of.append(shards.setdefault(shard, len(shards)))
+                self.resolution = resolution
         if not self.ids:
             over = f" with at most {max_triangles} triangles" if self.dropped else ""
             raise UserError(f"the dataset has no {split} scenes{over}: its splits are {', '.join(sorted(splits)) or 'empty'}")
+        # Lines are parsed again where needed: a tenth of the memory of parsed ones, and one block that processes share
+        self._lines, self._starts = b"".join(lines), np.cumsum([0, *map(len, lines)])
         self.triangles, self.shard_of = np.array(triangles), np.array(shard_of)
         self._sizes = self._shard_sizes(shards)
         self.cache_bytes = int(cache_mb * 1e6)
@@ -243,27 +250,23 @@ class ShardDataset:
 
     def row(self, index: int) -> dict[str, Any]:
         """A sample's line of the index: its views, shard, members and more."""
-        return json.loads(self._rows[index])
+        return json.loads(self._lines[self._starts[index] : self._starts[index + 1]])
 
     def read(self, index: int, views: Sequence[int] | None = None, layers: Sequence[str] = ()) -> Sample:
         """The sample with these views (None: all), their lights, and their AOVs if any ``layers`` are wanted."""
         row = self.row(index)
         wanted = row["views"] if views is None else sorted({int(view) for view in views})
         with Reader(self, row) as reader:
-            scene = self._cached(
-                (index, "scene"),
-                lambda: decode_scene(row["id"], reader["scene.npz"], reader["meta.json"]),
-            )
+            scene = self._cached((index, "scene"), lambda: decode_scene(row["id"], reader["scene.npz"], reader["meta.json"]))
             out = {}
             for view in wanted:
                 image, aov = view_members(view)
                 where = f"{image} of {row['id']}"
                 lights, meta = self._cached((index, image), lambda n=image, w=where: decode_lights(reader[n], w))
-                found: dict[str, Any] = dict.fromkeys(VIEW_FIELDS - {"lights", "meta"})
+                found = {}
                 if layers:
-                    decoded = self._cached((index, aov), lambda n=aov, w=where: decode_layers(reader[n], w))
-                    found |= {name: pixels for name, pixels in decoded.items() if name in VIEW_FIELDS}
-                out[view] = ViewRecord(lights, **found, meta=meta)
+                    found = self._cached((index, aov), lambda n=aov, w=where: decode_layers(reader[n], w))
+                out[view] = _view(lights, meta, found)
         return Sample(scene, out)
 
     def _cached(self, key: tuple[int, str], decode: Any) -> Any:
@@ -327,6 +330,8 @@ class Reader:
         id = self._row["id"]
         if self._file is None:
             self._file = self._open()
+        if name not in self._row["members"]:
+            raise DamagedSample(f"{id} has no member {name}")
         offset, size, crc = self._row["members"][name]
         if not 0 <= offset <= offset + size <= self._dataset._sizes[self._row["shard"]]:
             raise DamagedSample(f"{name} of {id} is said to lie outside its shard")

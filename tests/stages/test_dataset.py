@@ -227,6 +227,14 @@ def test_only_what_is_wanted_is_decoded(artifact, monkeypatch):
     assert dataset.read(1, [2], ["normal"]).views[2].normal.shape == (12, 12, 3)
 
 
+def test_layers_that_are_not_there_are_named(dataset):
+    with pytest.raises(ValueError, match="layers albdo are unknown: choose from direct, albedo"):
+        BatchConfig(layers=("albdo",))
+    with pytest.raises(UserError, match="have no layer 'triangle'"):
+        Batches(dataset, BatchConfig(layers=("triangle",)))(0)
+    assert "image" not in Batches(dataset, BatchConfig(views_per_scene=0))(0)
+
+
 # --- order, ranks, workers, resume ------------------------------------------------------------------------------------
 
 
@@ -406,6 +414,9 @@ def test_an_index_that_lies_is_refused(copy):
     text = (root / "files" / "index.jsonl").read_text()
     (root / "files" / "index.jsonl").write_text(text.replace(rows[0]["shard"], "../../../etc/passwd"))
     with pytest.raises(UserError, match="names a shard '../../../etc/passwd'"):
+        ShardDataset(root, "train")
+    (root / "files" / "index.jsonl").write_text(text[:-40])
+    with pytest.raises(UserError, match="line 14 of .*index.jsonl is no line of an index"):
         ShardDataset(root, "train")
     offset = rows[0]["members"]["scene.npz"][0]
     (root / "files" / "index.jsonl").write_text(text.replace(f"[{offset},", "[999999999999,"))
