@@ -95,7 +95,8 @@ def encode_scene(scene: SceneRecord) -> bytes:
     }
     out |= {name: getattr(scene, name) for name in ("patch_index", "patches") if getattr(scene, name, None) is not None}
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **{name: np.asfortranarray(out[name]) for name in sorted(out)})
+    columns = {name: np.asfortranarray(out[name]) if out[name].ndim == 2 else out[name] for name in sorted(out)}
+    np.savez_compressed(buffer, allow_pickle=False, **columns)
     return buffer.getvalue()
 
 

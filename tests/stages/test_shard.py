@@ -6,6 +6,7 @@ import io
 import json
 import re
 import zlib
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -113,6 +114,18 @@ def test_same_scene_same_bytes_and_damage_is_an_error(made):
             decode_scene(scene.id, broken, b"{}")
     with pytest.raises(UserError, match=scene.id):
         decode_scene(scene.id, data, b"{")
+
+
+def test_textures_keep_every_texel(made):
+    if "patches" not in {field.name for field in fields(SceneRecord)}:
+        pytest.skip("SceneRecord has no textures yet")
+    scene, rng = scenes(made[0])[0], np.random.default_rng(0)
+    index = np.full(len(scene.triangles), -1, np.int32)
+    index[[3, 9]] = [1, 0]
+    patches = rng.uniform(size=(2, 7, 32, 32)).astype(np.float16)
+    back = decode_scene("x", encode_scene(replace(scene, patch_index=index, patches=patches)), b"{}")
+    assert np.array_equal(back.patches, patches) and back.patches.dtype == np.float16
+    assert np.array_equal(back.patch_index, index) and decode_scene("x", encode_scene(scene), b"{}").patches is None
 
 
 # --- index and card ---------------------------------------------------------------------------------------------------
