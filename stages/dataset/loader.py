@@ -186,8 +186,8 @@ def prefetch(
 ) -> Iterator[Batch]:
     """The batches of steps ``start`` .. ``stop`` - 1 (None: without end) in order, prepared up to ``ahead`` steps early.
 
-    By threads of this process, which is enough for few cores (OpenEXR, zlib and numpy release Python's lock while they work), or
-    by ``workers`` processes, which also share what is left of Python (docs/dataset.md has the figures).
+    By threads of this process, which is enough for few cores (OpenEXR, zlib and numpy release Python's lock while they work),
+    or by ``workers`` processes, which also share what is left of Python (docs/dataset.md has the figures).
     """
     return _by_processes(batches, start, stop, ahead, workers) if workers else _by_threads(batches, start, stop, ahead)
 

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.errors import Reject, UserError
 from pipeline.hydra_config import compose
-from pipeline.runner import make_plan, split_config
+from pipeline.runner import make_plan, run_pipeline, split_config
 from pipeline.stage import Item
 from pipeline.store import hash_file
 from stages.cli import main
@@ -89,6 +89,18 @@ def test_the_key_is_that_of_the_content(folder, tmp_path):
     (tmp_path / "copy" / "train" / "mesh.obj").write_text(MESH.replace("v 1 0 0", "v 2 0 0"))
     after = keys(tmp_path / "copy")
     assert after["scene"] != before["scene"] and after["render"] != before["render"]
+
+
+def test_imported_scenes_are_rendered_and_sharded_like_any_other(folder, tmp_path):
+    from stages.dataset import ShardDataset
+
+    words = ["stage=shard", "scene=imported", f"scene.path={folder}", "render.resolution=8", "render.max_spp=1"]
+    words += ["render.backend=scalar", f"store={tmp_path}/store", "workers=0"]
+    shard = run_pipeline(compose(words), words, out=lambda line: None)["artifacts"]["shard"]
+    assert shard.groups() == ["test", "train", "validation"]
+    sample = ShardDataset(shard, "train")[0]
+    assert len(sample.scene.triangles) == 8 and sample.views[0].image.shape == (8, 8, 3) and sample.views[0].image.any()
+    assert '"name": "imported"' in shard.file("README.md").read_text()
 
 
 def test_the_commands_say_what_they_did(folder, tmp_path, capsys):
