@@ -21,8 +21,8 @@ MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n
 
 def scene_json(**light) -> str:
     solid = {"mesh_path": "mesh.obj", "material": {"diffuse": [0.5, 0.4, 0.3], "roughness": 0.7}, "transform": {}}
-    lamp = {"mesh_path": "mesh.obj", "material": {"emissive": [900, 900, 900]}, "transform": {"translation": [0, 0, 2]} | light}
-    camera = {"position": [0, -3, 1], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 45}
+    lamp = {"mesh_path": "mesh.obj", "material": {"emissive": [90, 90, 90]}, "transform": {"translation": [0, 0, 2]} | light}
+    camera = {"position": [3, 3, 2], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 45}
     return json.dumps({"scene_name": "s", "version": "1.0", "objects": {"a": solid, "l": lamp}, "cameras": [camera]})
 
 
