@@ -21,7 +21,7 @@ MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n
 
 def scene_json(**light) -> str:
     solid = {"mesh_path": "mesh.obj", "material": {"diffuse": [0.5, 0.4, 0.3], "roughness": 0.7}, "transform": {}}
-    lamp = {"mesh_path": "mesh.obj", "material": {"emissive": [90, 90, 90]}, "transform": {"translation": [0, 0, 2]} | light}
+    lamp = {"mesh_path": "mesh.obj", "material": {"emissive": [900, 900, 900]}, "transform": {"translation": [0, 0, 2]} | light}
     camera = {"position": [3, 3, 2], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 45}
     return json.dumps({"scene_name": "s", "version": "1.0", "objects": {"a": solid, "l": lamp}, "cameras": [camera]})
 
@@ -94,12 +94,12 @@ def test_the_key_is_that_of_the_content(folder, tmp_path):
 def test_imported_scenes_are_rendered_and_sharded_like_any_other(folder, tmp_path):
     from stages.dataset import ShardDataset
 
-    words = ["stage=shard", "scene=imported", f"scene.path={folder}", "render.resolution=8", "render.max_spp=4"]
+    words = ["stage=shard", "scene=imported", f"scene.path={folder}", "render.resolution=16", "render.max_spp=16"]
     words += ["render.backend=scalar", f"store={tmp_path}/store", "workers=0"]
     shard = run_pipeline(compose(words), words, out=lambda line: None)["artifacts"]["shard"]
     assert shard.groups() == ["test", "train", "validation"]
     sample = ShardDataset(shard, "train")[0]
-    assert len(sample.scene.triangles) == 8 and sample.views[0].image.shape == (8, 8, 3) and sample.views[0].image.any()
+    assert len(sample.scene.triangles) == 8 and sample.views[0].image.shape == (16, 16, 3) and sample.views[0].image.any()
     assert '"name": "imported"' in shard.file("README.md").read_text()
 
 
