@@ -113,7 +113,7 @@ def gather(draft: Any, rows: Iterable[Mapping[str, Any]]) -> dict[str, np.ndarra
         name: []
         for name in (
             "triangles", "lights", "roughness", "camera distance", "light distance", "field of view", "mean radiance",
-            "samples", "error", "clamped", "emission", "vertex", "bytes",
+            "samples", "error", "clamped", "emission", "vertex", "bytes", "noise", "noise relit", "noise psnr",
         )
     }  # fmt: skip
     for row in rows:
@@ -135,6 +135,10 @@ def gather(draft: Any, rows: Iterable[Mapping[str, Any]]) -> dict[str, np.ndarra
                 for name, key in (("mean radiance", "mean"), ("samples", "spp"), ("error", "error"), ("clamped", "clamped")):
                     if view.get(key) is not None:
                         out[name].append([view[key]])
+                if noise := view.get("noise"):  # of views that were rendered twice
+                    out["noise"].append([noise["sum"]["log_error"]])
+                    out["noise psnr"].append([noise["sum"]["psnr"]])
+                    out["noise relit"].append([one["log_error"] for one in noise["reweighted"]])
         out["bytes"].append([len(members["scene.npz"])])
     return {name: np.concatenate(values).astype(float) if values else np.zeros(0) for name, values in out.items()}
 
@@ -248,7 +252,7 @@ def sections(
     views = sum(len(row["views"]) for rows in by_split.values() for row in rows)
     scenes = sum(map(len, by_split.values()))
     resolution = max(row["resolution"] for rows in by_split.values() for row in rows)
-    every = {name: np.concatenate([columns[name] for columns in drawn.values()]) for name, *_ in PLOTS}
+    every = {name: np.concatenate([columns[name] for columns in drawn.values()]) for name in next(iter(drawn.values()))}
     about = Section("Dataset card")
     about.blocks += [
         ("text", f"Path-traced triangle scenes for neural renderers: {scenes:,} scenes, {views:,} views of {resolution} x "
@@ -289,16 +293,10 @@ def sections(
 
     shown = Section("Distributions")
     shown.blocks.append(("picture", "distributions.png", f"Shares per split, of at most {SAMPLED:,} scenes each"))
-    errors, samples = every["error"], every["samples"]
-    floor = (
-        "Noise floor: the estimated error of a view (mean absolute difference of log10(1 + radiance) to the converged image) "
-        f"is {errors.mean():.4f} in the mean, {np.median(errors):.4f} in the median, {np.quantile(errors, 0.95):.4f} at 95 %."
-        if len(errors)
-        else "Noise floor: not estimated; every view has a fixed number of samples (`render.target_error=0`)."
-    )
-    clamped = int(sum(columns["clamped"].sum() for columns in drawn.values()))
+    shown.blocks.append(("text", noise_floor(every)))
+    samples, clamped = every["samples"], int(every["clamped"].sum())
     spp = f"{np.median(samples):g} in the median, {samples.min():g}..{samples.max():g}" if len(samples) else "not noted"
-    shown.blocks.append(("text", f"{floor} Samples per pixel: {spp}. Radiance values clamped at 65,504: {clamped:,}."))
+    shown.blocks.append(("text", f"Samples per pixel: {spp}. Radiance values clamped at 65,504: {clamped:,}."))
 
     origins = Section("Objects, origins and licences")
     known: Counter = Counter()
@@ -329,6 +327,27 @@ def sections(
         ("code", WEBDATASET.strip()),
     ]  # fmt: skip
     return [about, fields, counts, shown, origins, made, files]
+
+
+def noise_floor(every: Mapping[str, np.ndarray]) -> str:
+    """How far images are from noiseless ones: of views rendered twice, and as the renderer estimates it."""
+
+    def spread(values: np.ndarray) -> str:
+        return (
+            f"{values.mean():.4f} in the mean, {np.median(values):.4f} in the median, {np.quantile(values, 0.95):.4f} at 95 %"
+        )
+
+    noise, errors = every["noise"], every["error"]
+    told = []
+    if len(noise):
+        told.append(
+            f"Noise floor, of {len(noise):,} views rendered twice, independently: mean absolute error of log10(1 + radiance) "
+            f"{spread(noise)}; PSNR of values clamped to 1 {every['noise psnr'].mean():.1f} dB; with reweighted lights "
+            f"{spread(every['noise relit'])}."
+        )
+    if len(errors):
+        told.append(f"Error of a view as the renderer estimates it, log10(1 + radiance): {spread(errors)}.")
+    return " ".join(told) or "Noise floor: not measured; every view has a fixed number of samples and was rendered once."
 
 
 def ranges(drawn: Mapping[str, Mapping[str, np.ndarray]]) -> list[tuple[str, ...]]:

@@ -107,7 +107,9 @@ def dataset_inputs(path: Path, train: int = 6, validation: int = 0, test: int = 
             members |= encode_view(ViewRecord(lights, **planes, **flat, meta={"index": index, "spp": 1}))
         noted = {"mean": 0.5, "spp": 16, "error": 0.01, "clamped": 0}
         statuses = ["ok", "dark", "ok", "ok"]
-        members["meta.json"] = pack_json({"views": [{"index": i, "status": s, **noted} for i, s in enumerate(statuses)]})
+        views = [{"index": i, "status": s, **noted} for i, s in enumerate(statuses)]
+        views[2]["noise"] = {"sum": {"log_error": 0.02, "psnr": 31.0}, "reweighted": [{"log_error": 0.03, "psnr": 30.0}] * 2}
+        members["meta.json"] = pack_json({"views": views})
         renders.append((item.group, Record(item.id, members)))
     return {"scene": FakeArtifact(path / "scene", scenes), "render": FakeArtifact(path / "render", renders)}
 

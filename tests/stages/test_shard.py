@@ -151,6 +151,9 @@ def test_card_tells_what_is_there_and_its_reader_works(made):
     _, artifact = made
     card, page = artifact.file("README.md").read_text(), artifact.file("card.html").read_text()
     assert "| train | 6 | 18 |" in card and "| CC0 | files |" in card and artifact.key in card
+    assert (
+        "of 8 views rendered twice" in card and "0.0200 in the mean" in card and "31.0 dB" in card and "0.0300 in the" in card
+    )
     assert "https://example.org/train-blob" in card and '"shard_mb": 256' in card
     assert page.count("data:image/png;base64,") == 2 and "<script" not in page and "http" not in page.split("<h2")[0]
     for name in artifact.read(artifact.ids()[0]).members:
