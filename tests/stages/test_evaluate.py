@@ -23,7 +23,7 @@ from stages.evaluation.statistics import JUDGED, METHODS, bootstrap, summarise, 
 from stages.exr import decode_rgb, encode_view
 from stages.metrics import METRICS, log_error, measure_all
 from stages.records import SceneRecord, ViewRecord
-from stages.s07_evaluate import Evaluate, EvaluateConfig, training_images
+from stages.s07_evaluate import Evaluate, EvaluateConfig, report_facts, training_images
 from stages.tonemap import clamp
 from tests.stages.fakes import FakeArtifact
 
@@ -286,6 +286,18 @@ def test_a_diverged_model_stops_the_run(inputs, predictor, tmp_path):
 def test_mean_image_sees_training_scenes_only_and_about_as_many_as_asked(inputs):
     assert sum(len(block) for block in training_images(inputs["shard"], 1000)) == 24
     assert sum(len(block) for block in training_images(inputs["shard"], 8)) == 8
+
+
+def test_without_training_scenes_the_mean_image_is_that_of_the_others_and_the_report_says_so(inputs):
+    only_test = Artifact(inputs["shard"].path, [("test", inputs["shard"].read(id)) for id in inputs["shard"].ids("test")])
+    assert sum(len(block) for block in training_images(only_test, 1000)) == 6
+    summary = {
+        "train": dict(layers=1, view_layers=1, width=8, parameters=1, steps=0, key="a"),
+        "data": {"key": "b", "split": "test"},
+    }
+    for scenes, told in (({"test": 3}, True), ({"train": 6, "test": 3}, False)):
+        summary["data"]["scenes"] = scenes
+        assert ("mean training image" in report_facts(summary, 16, "c")) == told
 
 
 def test_a_split_without_scenes_is_named(inputs):

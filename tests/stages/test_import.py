@@ -103,6 +103,20 @@ def test_imported_scenes_are_rendered_and_sharded_like_any_other(folder, tmp_pat
     assert '"name": "imported"' in shard.file("README.md").read_text()
 
 
+def test_a_given_checkpoint_is_measured_on_imported_scenes(folder, tmp_path, shared_data):
+    """No training scene, no training: evaluate takes somebody's model and somebody's scenes."""
+    shutil.rmtree(folder / "train")
+    shutil.rmtree(folder / "validation")
+    words = ["stage=evaluate", "scene=imported", f"scene.path={folder}", "render.resolution=64", "render.max_spp=1"]
+    words += ["train=given", f"train.checkpoint={shared_data}/parity/no-dpt", "render.backend=scalar", f"store={tmp_path}/s"]
+    made = run_pipeline(compose([*words, "workers=0"]), words, out=lambda line: None)["artifacts"]
+    assert made["train"].path.name.startswith("given-") and len(made["evaluate"].rows()) == 2
+    given = (shared_data / "parity" / "no-dpt" / "model.safetensors").read_bytes()
+    assert made["train"].file("checkpoint/model.safetensors").read_bytes() == given
+    with pytest.raises(UserError, match="holds no config.json"):
+        run_pipeline(compose([*words[:-3], f"train.checkpoint={tmp_path}", words[-1]]), words, out=lambda line: None)
+
+
 def test_the_commands_say_what_they_did(folder, tmp_path, capsys):
     assert main(["import", str(folder), f"store={tmp_path}/store", "workers=0"]) == 0
     assert "scene/imported-" in (out := capsys.readouterr().out) and "4 records" in out
