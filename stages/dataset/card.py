@@ -393,11 +393,13 @@ def to_markdown(card: Iterable[Section]) -> str:
             else:
                 header, rows = content
                 lines += ["| " + " | ".join(header) + " |", "| " + " | ".join("---" for _ in header) + " |"]
-                lines += [
-                    "| " + " | ".join(str(cell).replace("|", "\\|").replace("<", "\\<") for cell in row) + " |" for row in rows
-                ]
-                lines += [""]
+                lines += [f"| {' | '.join(map(_cell, row))} |" for row in rows] + [""]
     return "\n".join(lines)
+
+
+def _cell(value: Any) -> str:
+    """A table's cell: on one line, and nothing in it that Markdown would read."""
+    return " ".join(str(value).split()).replace("|", "\\|").replace("<", "\\<")
 
 
 STYLE = """
