@@ -158,7 +158,7 @@ PLOTS = (  # quantity, label, scale
     ("mean radiance", "exposure: mean radiance of a view", "log"),
     ("samples", "samples per pixel of a view", "log2"),
     ("error", "estimated error of a view, log10(1 + x)", "log"),
-    ("noise", "noise floor: a view rendered twice, log10(1 + x)", "log"),
+    ("noise", "noise floor of a view, log10(1 + x)", "log"),
 )
 
 
@@ -191,11 +191,15 @@ def plot_distributions(drawn: Mapping[str, Mapping[str, np.ndarray]], path: Path
             shares = np.histogram(mine, edges)[0] / len(mine)
             style = {"fill": True, "alpha": 0.35} if split == "train" else {"linewidth": 1.5}
             axes.stairs(shares, edges, label=f"{split} ({len(mine):,})", color=color, **style)
-        if scale == "log":
-            axes.set_xscale("log")
-        elif scale == "log2":
-            ticks = 2.0 ** np.arange(np.floor(np.log2(low)), np.floor(np.log2(high)) + 1)
-            axes.set_xscale("log", base=2)
+        if scale in ("log", "log2"):
+            axes.set_xscale("log", base=2 if scale == "log2" else 10)
+            if scale == "log2":
+                ticks = 2.0 ** np.arange(np.floor(np.log2(low)), np.floor(np.log2(high)) + 1)
+            elif high > 30 * low:
+                ticks = 10.0 ** np.arange(np.ceil(np.log10(low)), np.floor(np.log10(high)) + 1)
+            else:  # no or one power of ten in it
+                ticks = np.array([float(f"{tick:.2g}") for tick in np.geomspace(edges[0], edges[-1], 4)])
+            ticks = ticks[:: -(-len(ticks) // 6)]
             axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
             axes.minorticks_off()
         axes.set_ylabel("share")
