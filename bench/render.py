@@ -54,7 +54,7 @@ import numpy as np
 
 from pipeline.keys import seed_for
 from pipeline.store import Artifact
-from stages.exr import encode_view, read_rgb
+from stages.exr import encode_view, read_rgb, view_members
 from stages.metrics import log_error
 from stages.records import SceneRecord
 from stages.released import load_scene
@@ -410,7 +410,7 @@ def produce(job: dict[str, Any]) -> dict[str, Any]:
             max_depth=MAX_DEPTH,
             threads=job["threads"],
         )[0]
-        (Path(job["out"]) / f"{path.stem}.exr").write_bytes(encode_view(record))
+        (Path(job["out"]) / f"{path.stem}.exr").write_bytes(encode_view(record)[view_members(record.meta["index"])[0]])
         rows.append({"seconds": time.perf_counter() - start, "spp": record.meta["spp"], "estimate": record.meta["error"]})
     return {"seconds": time.perf_counter() - began, "views": rows}
 

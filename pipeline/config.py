@@ -82,7 +82,8 @@ def parse(kind: Any, data: Any, where: str) -> Any:
     except ValidationError as error:
         lines = []
         for problem in error.errors():
-            location = [str(part) for part in problem["loc"]]
+            tag = 0 if isinstance(kind, type) else 1  # pydantic puts a union's chosen branch first; nobody wrote that
+            location = [str(part) for part in problem["loc"][tag:]]
             path = ".".join([where, *location])
             if problem["type"] == "extra_forbidden":
                 lines.append(f"{path} is unknown{nearest(location[-1], _fields(kind, data))}")

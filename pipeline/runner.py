@@ -298,7 +298,7 @@ def _run_map(
     markers: dict[str, dict[str, Any] | None] = {}
     tasks: list[PartTask] = []
     total, reused = len(items), 0
-    for group, indices in _parts(items, keys, stage.part_size(config)):
+    for group, indices in _parts(items, keys, stage.part_size(config, inputs)):
         part_items = tuple(items[index] for index in indices)
         part_item_keys = tuple(keys[index] for index in indices)
         part_key = digest_of({"group": group, "items": part_item_keys})

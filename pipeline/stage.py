@@ -97,8 +97,8 @@ class MapStage(Stage):
 
     limits: ClassVar[Mapping[str, float]] = {}  # of one item, where they differ from pipeline.config.Limits
 
-    def part_size(self, config: StageConfig) -> int:
-        """Items per part. Independent of the number of workers."""
+    def part_size(self, config: StageConfig, inputs: Inputs) -> int:
+        """Items per part, from what the config and the inputs say: independent of the number of workers."""
         return 16
 
     def max_workers(self, config: StageConfig, environment: dict[str, Any]) -> int | None:

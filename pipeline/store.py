@@ -573,3 +573,16 @@ def iter_inputs(store: Store, artifact: Artifact) -> Iterator[tuple[str, str, Ar
     """(input name, key, artifact or None if it is gone) of each input."""
     for name, key in artifact.manifest["preimage"]["inputs"].items():
         yield name, key, store.find(name, key)
+
+
+def history(inputs: Mapping[str, Artifact]) -> dict[str, dict[str, Any]]:
+    """Stage -> preimage of its key, for ``inputs`` and everything upstream of them that is still in the store."""
+    found: dict[str, dict[str, Any]] = {}
+    todo = list(inputs.values())
+    while todo:
+        artifact = todo.pop()
+        if artifact.stage not in found:
+            found[artifact.stage] = artifact.manifest["preimage"]
+            store = Store(artifact.path.parents[1])
+            todo += [parent for _, _, parent in iter_inputs(store, artifact) if parent is not None]
+    return found

@@ -1,4 +1,4 @@
-"""The ``lightmill`` command: run, the store's commands, and trace, predict, compare for single scenes and images.
+"""The ``lightmill`` command: run, the store's commands, export and import, and trace, predict, compare for single scenes.
 
 Heavy libraries are imported by the command that needs them, so that ``lightmill ls`` answers at once.
 """
@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from pipeline.commands import add_commands
 from pipeline.errors import UserError
@@ -80,6 +81,36 @@ def command_compare(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def dataset_source(reference: str, store: str) -> Any:
+    """A dataset's folder or URL as given, or a shard artifact in the store."""
+    from stages.dataset.shards import INDEX, REMOTE
+
+    if REMOTE.match(reference) or (Path(reference) / "files" / INDEX).is_file():
+        return reference
+    from pipeline.store import Store
+
+    artifact = Store(store).resolve(reference)
+    if artifact.stage != "shard":
+        raise UserError(f"{reference} is an artifact of stage {artifact.stage}: give one of stage shard, a folder or a URL")
+    return artifact
+
+
+def command_export(arguments: argparse.Namespace) -> int:
+    from stages.interchange import export
+
+    source, out = dataset_source(arguments.dataset, arguments.store), Path(arguments.out)
+    count = sum(1 for _ in export(source, out, arguments.split, arguments.images))
+    print(f"{count} scenes in {out}")
+    return 0
+
+
+def command_import(arguments: argparse.Namespace) -> int:
+    from pipeline.__main__ import main as run_main
+
+    words = ["stage=scene", "scene=imported", f"scene.path={json.dumps(arguments.folder)}", *arguments.words]
+    return run_main([*words, *(["--debug"] if arguments.debug else [])])
+
+
 def view_argument(text: str) -> int | str:
     if text == "all":
         return text
@@ -105,6 +136,20 @@ def build_parser() -> argparse.ArgumentParser:
     sub = add("run", command_run, "run stages (the same as python -m pipeline)", "stage=shard scene.count.train=200")
     sub.usage = f"{PROGRAM} run [stage=STAGE] [name=value ...] [-m] [--debug]"
     add_commands(parsers, PROGRAM)
+
+    sub = add("export", command_export, "scenes of a dataset as released HDF5 files", "shard exported --split test --images")
+    sub.add_argument("dataset", help="shard artifact's key, name or 'shard'; a dataset's folder or URL")
+    sub.add_argument("out", help="folder; scenes go to OUT/SPLIT/ID.h5")
+    sub.add_argument("--split", action="append", help="train, validation or test; may be repeated (default: all)")
+    sub.add_argument("--images", action="store_true", help="also ID-view<camera>.exr: linear RGB with all lights on")
+    sub.add_argument("--store", default="store", help="the store's folder (default: store)")
+
+    sub = add(
+        "import", command_import, "released JSON and HDF5 scenes as scenes to render (then: stage=render scene=imported ..)",
+        "scenes scene.split=test",
+    )  # fmt: skip
+    sub.add_argument("folder", help="folder of scene files; train/, validation/ and test/ in it are splits")
+    sub.usage = f"{PROGRAM} import FOLDER [name=value ...] [--debug]"
 
     sub = add("trace", command_trace, "path trace a scene given as released JSON or HDF5", "scene.json -o out.exr --spp 256")
     sub.add_argument("scene", help="scene file: .json or .h5")
@@ -139,7 +184,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(words: Sequence[str] | None = None) -> int:
     """Returns the exit status: 0, 1 for what a check found, 2 for an error that the user can mend."""
     arguments, unknown = build_parser().parse_known_args(words)
-    if arguments.function is command_run:
+    if arguments.function in (command_run, command_import):
         arguments.words = unknown  # overrides and Hydra's own flags, in any order
     elif unknown:
         build_parser().error(f"unknown arguments: {' '.join(unknown)}; see {PROGRAM} COMMAND --help")

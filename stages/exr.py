@@ -1,15 +1,19 @@
-"""OpenEXR files: a rendered view as one multi-layer half-float image, and plain RGB pictures for the commands.
+"""OpenEXR files: a rendered view as two multi-layer images, and plain RGB pictures for the commands.
 
-A view's layers are named as EXR viewers expect: ``light0.R`` .. ``light0.B``, ``light1.R`` .., ``direct.R``,
-``albedo.R``, ``normal.X`` .. ``normal.Z``, ``depth.Z``, ``coverage.A``, and ``triangle.id`` and ``object.id`` as 32-bit
-integers plus one, 0 for nothing; the header attribute ``lightmill`` holds the view's meta as JSON. The same view always
-gives the same bytes: OpenEXR writes no clock, and compression is lossless and done by one thread.
+A view is two members of a record, so that who wants only the image neither reads nor decodes the rest: ``view<i>.exr`` with
+a layer per light (``light0.R`` .. ``light0.B``, ``light1.R`` ..) and ``view<i>.aov.exr`` with what ``LAYERS`` lists
+(``direct.R``, ``normal.X``, ``depth.Z``, ``triangle.id`` ..; arbitrary output variables, as renderers call them). The header
+attribute ``lightmill`` of the first holds the view's meta as JSON. The same view always gives the same bytes: OpenEXR writes no
+clock, and compression is lossless and done by one thread. Why this compression: docs/dataset.md.
 """
 
 from __future__ import annotations
 
 import io
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,10 +22,27 @@ from stages.arrays import pack_json, unpack_json
 from stages.records import ViewRecord
 
 HALF_MAX = 65504.0  # largest finite half float
+MAX_SIDE = 16384  # pixels; what a header may claim
 META = "lightmill"  # header attribute
-# Single layers of a view: name, channels (in the order of the array's last axis).
-LAYERS = {"direct": "RGB", "albedo": "RGB", "normal": "XYZ", "depth": "Z", "coverage": "A"}
-INDICES = ("triangle", "object")
+
+
+class Layer(NamedTuple):
+    """Channels of an AOV layer, in the order of the array's last axis. Indices are stored plus one, 0 for nothing."""
+
+    channels: Sequence[str]
+    dtype: type = np.float16
+
+
+LAYERS = {
+    "direct": Layer("RGB"),
+    "albedo": Layer("RGB"),
+    "normal": Layer("XYZ"),
+    "depth": Layer("Z"),
+    "coverage": Layer("A"),
+    "triangle": Layer(("id",), np.uint32),
+    "object": Layer(("id",), np.uint32),
+}
+VIEW = re.compile(r"view(\d+)\.exr\Z")  # a view's first member
 
 
 def _encode(header: dict, channels: dict[str, np.ndarray]) -> bytes:
@@ -37,12 +58,17 @@ def _decode(data: bytes, where: str) -> tuple[dict, dict[str, np.ndarray]]:
     """Header and channels of an EXR file, one (H, W) array per channel."""
     import OpenEXR
 
+    OpenEXR.setMaxImageSize(MAX_SIDE, MAX_SIDE)
     try:
         with OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0) as file:
             return dict(file.header()), {name: channel.pixels for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError, TypeError, OSError) as error:
+    except (RuntimeError, ValueError, TypeError, OSError, MemoryError) as error:
         detail = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(f"{where} is not an OpenEXR image that can be read ({detail})") from error
+
+
+def _half(pixels: np.ndarray) -> np.ndarray:
+    return np.clip(pixels, -HALF_MAX, HALF_MAX).astype(np.float16)
 
 
 def clamped_values(view: ViewRecord) -> int:
@@ -50,34 +76,78 @@ def clamped_values(view: ViewRecord) -> int:
     return int(sum((layer > HALF_MAX).sum() for layer in (view.lights, view.direct)))
 
 
-def encode_view(view: ViewRecord) -> bytes:
-    """The view as half-float EXR bytes; values over 65,504 become 65,504."""
-    channels = {}
-    layers = {f"light{index}": (light, "RGB") for index, light in enumerate(view.lights)}
-    layers |= {name: (getattr(view, name), letters) for name, letters in LAYERS.items()}
-    for name, (pixels, letters) in layers.items():
-        half = np.clip(pixels, -HALF_MAX, HALF_MAX).astype(np.float16).reshape(*pixels.shape[:2], len(letters))
-        channels |= {f"{name}.{letter}": half[..., index] for index, letter in enumerate(letters)}
-    channels |= {f"{name}.id": (getattr(view, name) + 1).astype(np.uint32) for name in INDICES}
-    return _encode({META: pack_json(view.meta).decode()}, channels)
+def view_members(index: int) -> tuple[str, str]:
+    """Names of a view's two members: its lights, its AOVs."""
+    return f"view{index}.exr", f"view{index}.aov.exr"
 
 
-def decode_view(data: bytes, where: str = "the view") -> ViewRecord:
-    """A view from the bytes of ``encode_view``, as float32."""
+def size_of(data: bytes, where: str = "the view") -> tuple[int, int]:
+    """Height and width of an EXR image, from its header."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
+            low, high = file.header()["dataWindow"]
+    except (RuntimeError, ValueError, TypeError, OSError, KeyError) as error:
+        raise UserError(f"{where} is not an OpenEXR image that can be read ({error})") from error
+    return int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
+
+
+def encode_view(view: ViewRecord) -> dict[str, bytes]:
+    """The view's two members; floats become half floats, those over 65,504 become 65,504."""
+    lights = {
+        f"light{i}.{letter}": _half(light[..., j]) for i, light in enumerate(view.lights) for j, letter in enumerate("RGB")
+    }
+    if not lights:  # an EXR file has at least one channel
+        lights = {"none.A": np.zeros(view.depth.shape, np.float16)}
+    layers = {}
+    for name, (letters, dtype) in LAYERS.items():
+        pixels = getattr(view, name)
+        pixels = (pixels + 1).astype(dtype) if dtype is np.uint32 else _half(pixels)
+        pixels = pixels.reshape(*pixels.shape[:2], len(letters))
+        layers |= {f"{name}.{letter}": pixels[..., i] for i, letter in enumerate(letters)}
+    image, aov = view_members(view.meta["index"])
+    return {image: _encode({META: pack_json(view.meta).decode()}, lights), aov: _encode({}, layers)}
+
+
+def decode_lights(data: bytes, where: str = "the view") -> tuple[np.ndarray, dict]:
+    """(L, H, W, 3) float32 radiance by light, and the view's meta. In memory colours are planes, as they are in the file."""
     header, channels = _decode(data, where)
     if META not in header:
         raise UserError(f"{where} has no header attribute {META!r}: it is not a view that lightmill rendered")
-
-    def layer(name: str, letters: str) -> np.ndarray:
-        pixels = np.stack([channels[f"{name}.{letter}"] for letter in letters], axis=-1).astype(np.float32)
-        return pixels if len(letters) > 1 else pixels[..., 0]
-
-    single = {name: layer(name, letters) for name, letters in LAYERS.items()}
-    single |= {name: channels[f"{name}.id"].astype(np.int32) - 1 for name in INDICES}
+    meta = unpack_json(header[META])
     count = sum(name.startswith("light") and name.endswith(".R") for name in channels)
-    lights = [layer(f"light{index}", "RGB") for index in range(count)]
-    shape = (0, *single["direct"].shape)
-    return ViewRecord(np.stack(lights) if lights else np.zeros(shape, np.float32), **single, meta=unpack_json(header[META]))
+    names = [f"light{i}.{letter}" for i in range(count) for letter in "RGB"]
+    planes = _planes(channels, names, where).reshape(count, 3, *next(iter(channels.values())).shape)
+    return np.moveaxis(planes, 1, -1), meta
+
+
+def decode_layers(data: bytes, where: str = "the view") -> dict[str, np.ndarray]:
+    """AOV layers by name: (H, W, 3) or (H, W) float32, indices (H, W) int32 with -1 for nothing."""
+    _, channels = _decode(data, where)
+    layers = {}
+    for name, (letters, dtype) in LAYERS.items():
+        index = dtype is np.uint32
+        planes = _planes(channels, [f"{name}.{letter}" for letter in letters], where, np.int32 if index else np.float32)
+        layers[name] = planes[0] - 1 if index else np.moveaxis(planes, 0, -1) if len(letters) > 1 else planes[0]
+    return layers
+
+
+def _planes(channels: Mapping[str, np.ndarray], names: list[str], where: str, dtype: type = np.float32) -> np.ndarray:
+    """(len(names), H, W): the file's own order, which costs no shuffling of pixels."""
+    planes = np.empty((len(names), *next(iter(channels.values())).shape), dtype)
+    for plane, name in zip(planes, names, strict=True):
+        if name not in channels:
+            raise UserError(f"{where} has no channel {name}: it is not a view that lightmill rendered")
+        plane[...] = channels[name]
+    return planes
+
+
+def decode_view(members: Mapping[str, bytes], index: int, where: str = "the view") -> ViewRecord:
+    """View ``index`` of a record, whole."""
+    image, aov = view_members(index)
+    lights, meta = decode_lights(members[image], where)
+    return ViewRecord(lights, **decode_layers(members[aov], where), meta=meta)
 
 
 def encode_rgb(image: np.ndarray, dtype: type = np.float16) -> bytes:
@@ -90,7 +160,7 @@ def decode_rgb(data: bytes, where: str = "the image") -> np.ndarray:
     """(H, W, 3) float32 linear RGB from any EXR image: R, G and B, one grey channel, or a view's lights summed."""
     header, channels = _decode(data, where)
     if META in header:
-        return decode_view(data, where).image
+        return decode_lights(data, where)[0].sum(axis=0)
     if set("RGB") <= channels.keys():
         return np.stack([channels[letter] for letter in "RGB"], axis=-1).astype(np.float32)
     if len(channels) == 1:

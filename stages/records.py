@@ -167,7 +167,7 @@ class SceneRecord:
 
     @classmethod
     def from_members(cls, id: str, members: Mapping[str, bytes]) -> SceneRecord:
-        """From the members ``scene.npz`` and ``meta.json``, of a record or of a shard's sample."""
+        """From the members ``scene.npz`` and ``meta.json`` of a *scene* record; a shard's are ``stages.dataset.encoding``'s."""
         return cls(id, **unpack_arrays(members["scene.npz"]), meta=unpack_json(members["meta.json"]))
 
     @classmethod

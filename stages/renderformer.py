@@ -11,7 +11,7 @@ SYSTEM = System(
         "scene": "stages.s03_scene:SampleScene",
         "render": "stages.s04_render:Render",
         "shard": "stages.s05_shard:Shard",
-        "train": "stages.s06_train:Train",
+        "train": "stages.s06_given:TrainOrGiven",
         "evaluate": "stages.s07_evaluate:Evaluate",
     },
     groups=("model",),

@@ -186,7 +186,7 @@ class SampleScene(MapStage):
     def slug(self, config: SceneConfig) -> str:
         return f"{config.name}-{config.max_triangles}"
 
-    def part_size(self, config: SceneConfig) -> int:
+    def part_size(self, config: SceneConfig, inputs: Inputs) -> int:
         return 64
 
     def items(self, config: SceneConfig, inputs: Inputs) -> Iterator[Item]:

@@ -1,7 +1,7 @@
 """render: path-traced views of every scene, light by light (paper section 3.3).
 
-Reads *scene*; writes per scene ``view<i>.exr`` for every kept camera i (layers: ``stages.exr``) and ``meta.json``
-with what was noted of all cameras. One design choice: radiance is stored per light, as light transport is linear:
+Reads *scene*; writes per scene ``view<i>.exr`` and ``view<i>.aov.exr`` for every kept camera i (``stages.exr``) and
+``meta.json`` with what was noted of all cameras. One design choice: radiance is stored per light, as light transport is linear:
 the image under any other choice of intensities and colours is a weighted sum, at no rendering cost.
 
 As in the paper's data, views whose mean radiance is under 0.01 or whose nearest depth is under 0.01 are dropped. Some of the
@@ -51,7 +51,7 @@ class RenderWorker:
 
 class Render(MapStage):
     name = "render"
-    version = 3
+    version = 4
     inputs = ("scene",)
     Config = RenderConfig
     reasons = {
@@ -63,7 +63,7 @@ class Render(MapStage):
     def slug(self, config: RenderConfig) -> str:
         return f"{config.mode}-{config.resolution}px-{config.max_spp}spp"
 
-    def part_size(self, config: RenderConfig) -> int:
+    def part_size(self, config: RenderConfig, inputs: Inputs) -> int:
         return 4
 
     def environment(self, config: RenderConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
@@ -113,7 +113,9 @@ class Render(MapStage):
         add_pairs(views, lambda indices: render(seed, indices), seed, config.noise_share)
         meta = {"template": scene.meta["template"], "variant": scene.meta["variant"], "lights": scene.n_lights}
         members = {"meta.json": pack_json({**meta, "views": [view.meta for view in views]})}
-        members |= {f"view{view.meta['index']}.exr": encode_view(view) for view in views if view.meta["status"] == "ok"}
+        for view in views:
+            if view.meta["status"] == "ok":
+                members |= encode_view(view)
         yield Record(item.id, members)
 
     def finish(self, config: RenderConfig, inputs: Inputs, draft: Any) -> None:

@@ -138,11 +138,10 @@ class Train(RunStage):
             f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f}M parameters ({config.model.name}) on {device}, "
             f"{torch.get_num_threads()} threads; {len(train)} training and {len(validation)} validation scenes"
         )
-        first = batches(0)
         multiple = model.config.resolution_multiple
-        if first["image"].shape[2] % multiple:
+        if train.resolution % multiple:
             raise UserError(
-                f"images of {first['image'].shape[2]} px cannot train {config.model.name}: its resolution must be a "
+                f"images of {train.resolution} px cannot train {config.model.name}: its resolution must be a "
                 f"multiple of {multiple} (render.resolution)"
             )
         summary = fit(
@@ -172,9 +171,7 @@ class Train(RunStage):
             device,
             draft.log,
         )
-        index = json.loads(inputs["shard"].file("index.json").read_text())
-        most = max(index[id]["triangles"] for id in train.ids)
-        trained_with = {"triangles": str(most), "resolution": str(first["image"].shape[2])}
+        trained_with = {"triangles": str(train.triangles.max()), "resolution": str(train.resolution)}
         checkpoint.save(model, draft.files / "checkpoint", trained_with)
         rows = [json.loads(line) for line in (draft.state / LOG).read_text().splitlines()]
         (draft.files / LOG).write_text("".join(json.dumps(row) + "\n" for row in rows))

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SMALL = [
     "collect.per_family=1", "remesh.resolution=48", "decimate.budgets=[64,128]",
     "scene.count.train=8", "scene.count.validation=2", "scene.count.test=3", "scene.cameras.views=2",
-    "render.resolution=32", "render.max_spp=2", "shard.scenes_per_shard=4",
+    "render.resolution=32", "render.max_spp=2", "shard.shard_mb=0.2",
     "train.steps=3", "train.batch_scenes=2", "train.views_per_scene=2", "train.warmup=1",
 ]  # fmt: skip
 

@@ -25,7 +25,7 @@ from PIL import Image, ImageDraw, ImageFont
 from pipeline.keys import seed_for
 from pipeline.stage import Record
 from stages.arrays import unpack_json
-from stages.exr import decode_view
+from stages.exr import decode_lights, decode_view, view_members
 from stages.records import ViewRecord
 from stages.tonemap import exposure_for, to_picture
 
@@ -99,7 +99,7 @@ def _scene_block(id: str, read: Read) -> Image.Image:
     """The views of one scene side by side, the scene's name above, a line on each below."""
     noted = _meta(id, read)
     views, lights = noted["views"], noted["lights"]
-    images = {meta["index"]: fit(_view(id, meta["index"], read).image) for meta in views if meta["status"] == "ok"}
+    images = {meta["index"]: fit(_image(id, meta["index"], read)) for meta in views if meta["status"] == "ok"}
     exposure = exposure_for(np.concatenate([image.reshape(-1, 3) for image in images.values()]))
     tiles = []
     for meta in views[:COLUMNS]:
@@ -172,9 +172,14 @@ def _meta(id: str, read: Read) -> dict[str, Any]:
     return unpack_json(read(id, ("meta.json",)).members["meta.json"])
 
 
+def _image(id: str, index: int, read: Read) -> np.ndarray:
+    name, _ = view_members(index)
+    return decode_lights(read(id, (name,)).members[name], f"{name} of {id}")[0].sum(axis=0)
+
+
 def _view(id: str, index: int, read: Read) -> ViewRecord:
-    name = f"view{index}.exr"
-    return decode_view(read(id, (name,)).members[name], f"{name} of {id}")
+    names = view_members(index)
+    return decode_view(read(id, names).members, index, f"{names[0]} of {id}")
 
 
 def _exposure(exposure: float) -> str:

@@ -37,7 +37,7 @@ def missing(model: BaseModel, section: dict, path: str) -> list[str]:
 @pytest.mark.parametrize(("stage", "variant"), VARIANTS)
 def test_yaml_names_every_field_of_its_config(stage, variant):
     root = compose([f"{stage}={variant}", *NEEDED.get((stage, variant), [])])
-    config = parse(SYSTEM.stage(stage).Config, root[stage], stage)
+    config = parse(load_system(root["system"]).stage(stage).Config, root[stage], stage)
     assert missing(config, root[stage], stage) == []
 
 
@@ -60,6 +60,14 @@ def test_every_model_is_a_valid_config(model):
 def test_wrong_words_name_the_right_ones(overrides, message):
     with pytest.raises(UserError, match=message):
         compose(overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"), [(["train.lr=-1"], r"^train\.lr=-1: "), (["+train.lrr=1"], r"^train\.lrr is unknown")]
+)
+def test_wrong_values_are_named_as_they_are_written(overrides, message):
+    with pytest.raises(UserError, match=message):
+        parse(SYSTEM.stage("train").Config, compose(overrides)["train"], "train")
 
 
 def test_sweep_keys_are_known_before_it_runs(tmp_path):

@@ -31,7 +31,7 @@ class Numbers(MapStage):
     Config = NumbersConfig
     reasons = {"unlucky": "thirteen"}
 
-    def part_size(self, config):
+    def part_size(self, config, inputs):
         return 4
 
     def items(self, config, inputs):
@@ -73,7 +73,7 @@ class Squares(MapStage):
     inputs = ("numbers",)
     Config = SquaresConfig
 
-    def part_size(self, config):
+    def part_size(self, config, inputs):
         return 3
 
     def items(self, config, inputs):

@@ -1,14 +1,17 @@
-"""Stand-ins for artifacts and drafts, with the interface of ``pipeline.store`` and nothing on disk but ``files/``."""
+"""Stand-ins for the artifacts that stages read, with nothing on disk but ``files/``; and real shards made of them."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 
+from pipeline.keys import digest_of
 from pipeline.stage import Record
+from pipeline.store import Artifact, Store
 from stages.arrays import pack_arrays, pack_json
 
 
@@ -16,13 +19,19 @@ class FakeArtifact:
     """Records in memory; serves as draft too."""
 
     def __init__(self, path: Path, records: list[tuple[str, Record]]):
-        self.path, self.files, self.notes = path, path / "files", {}
+        self.path, self.files, self.notes, self.stage = path, path / "files", {}, path.name
+        self.manifest = {"preimage": {"stage": self.stage, "version": 1, "params": {"seed": 0}, "inputs": {}}}
         self.files.mkdir(parents=True, exist_ok=True)
         self._records = {record.id: (group, record) for group, record in records}
 
     def rows(self):
         stored = self._records.items()
-        rows = [SimpleNamespace(id=id, item=id, group=group, members=record.members) for id, (group, record) in stored]
+        rows = [
+            SimpleNamespace(
+                id=id, item=id, group=group, members={name: (0, len(data)) for name, data in record.members.items()}
+            )
+            for id, (group, record) in stored
+        ]
         return sorted(rows, key=lambda row: (row.group, row.id))
 
     def ids(self, group=None):
@@ -34,10 +43,6 @@ class FakeArtifact:
 
     def file(self, name):
         return self.files / name
-
-    def part_of(self, id):
-        group = self._records[id][0]
-        return self.path / "parts" / f"{group}.tar", group
 
     def note(self, name, value):
         self.notes[name] = value
@@ -83,47 +88,85 @@ def decimated(path: Path, per_split: int = 4) -> FakeArtifact:
     return artifact
 
 
-def dataset_inputs(path: Path, train: int = 6, test: int = 2, size: int = 12) -> dict[str, FakeArtifact]:
-    """*scene* and *render* artifacts with random images; camera 1 of every scene was dropped by the renderer."""
+def with_textures(scene, count: int = 4):
+    """The scene with its largest triangles textured: red rises towards corner 1, green towards corner 2."""
+    from stages.records import PATCH_KEPT, patch_means
+
+    edges = scene.triangles[:, 1:] - scene.triangles[:, :1]
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * (scene.light_index < 0)
+    faces = np.sort(np.argsort(-area, kind="stable")[:count])
+    patches = np.full((count, 7, 32, 32), 0.25, np.float16)
+    row, column = np.indices((32, 32))
+    patches[:, 0], patches[:, 1], patches[:, 6] = column / 32, row / 32, 0.5
+    patches[:, 2] = np.arange(count)[:, None, None] / count
+    patches *= PATCH_KEPT
+    index = np.full(len(scene.triangles), -1, np.int32)
+    index[faces] = np.arange(count)[::-1]  # rows need not lie in the order of faces
+    columns = {name: getattr(scene, name).copy() for name in ("diffuse", "specular", "roughness")}
+    for name, means in patch_means(patches).items():
+        columns[name][faces] = means[index[faces]]
+    return replace(scene, **columns, patch_index=index, patches=patches)
+
+
+def dataset_inputs(path: Path, train: int = 6, validation: int = 0, test: int = 2, size: int = 12) -> dict[str, FakeArtifact]:
+    """*scene* and *render* artifacts with random images; camera 1 of every scene was dropped by the renderer.
+
+    Every other training scene is textured.
+    """
     from stages.exr import encode_view
     from stages.records import SceneRecord, ViewRecord
     from stages.s03_scene import SampleScene, SceneConfig, SceneCount
 
-    config, stage = SceneConfig(count=SceneCount(train=train, validation=0, test=test)), SampleScene()
+    config, stage = SceneConfig(count=SceneCount(train=train, validation=validation, test=test)), SampleScene()
     decimate = {"decimate": decimated(path / "decimate")}
     worker, scenes, renders = stage.open(config, decimate, {}), [], []
     for item in stage.items(config, decimate):
-        record = next(iter(stage.process(worker, item)))
-        scenes.append((item.group, record))
-        scene, rng, members = SceneRecord.from_record(record), np.random.default_rng(len(scenes)), {}
+        scene = SceneRecord.from_record(next(iter(stage.process(worker, item))))
+        if item.id.startswith("train") and int(item.id[-1]) % 2 == 0:
+            scene = with_textures(scene)
+        scenes.append((item.group, scene.to_record()))
+        rng, members = np.random.default_rng(len(scenes)), {}
         for index in (0, 2, 3):
             lights = rng.uniform(0, 2, (scene.n_lights, size, size, 3)).astype(np.float16).astype(np.float32)
             planes = {name: rng.uniform(size=(size, size, 3)).astype(np.float32) for name in ("direct", "albedo", "normal")}
             flat = {name: np.ones((size, size), np.float32) for name in ("depth", "coverage")}
-            flat |= {name: np.zeros((size, size), np.int32) for name in ("triangle", "object")}
-            members[f"view{index}.exr"] = encode_view(ViewRecord(lights, **planes, **flat, meta={"index": index, "spp": 1}))
-        members["meta.json"] = pack_json({"views": [{"index": index, "status": "ok"} for index in range(4)]})
+            flat |= {name: rng.integers(-1, 9, (size, size), np.int32) for name in ("triangle", "object")}
+            members |= encode_view(ViewRecord(lights, **planes, **flat, meta={"index": index, "spp": 1}))
+        noted = {"mean": 0.5, "spp": 16, "error": 0.01, "clamped": 0}
+        statuses = ["ok", "dark", "ok", "ok"]
+        views = [{"index": i, "status": s, **noted} for i, s in enumerate(statuses)]
+        views[2]["noise"] = {"sum": {"log_error": 0.02, "psnr": 31.0}, "reweighted": [{"log_error": 0.03, "psnr": 30.0}] * 2}
+        meta = {"template": scene.meta["template"], "variant": scene.meta["variant"], "lights": scene.n_lights}
+        members["meta.json"] = pack_json({**meta, "views": views})
         renders.append((item.group, Record(item.id, members)))
     return {"scene": FakeArtifact(path / "scene", scenes), "render": FakeArtifact(path / "render", renders)}
 
 
-def sharded(path: Path) -> tuple[dict[str, FakeArtifact], FakeArtifact]:
-    """The inputs of *shard* and its artifact, one tar per split."""
-    from pipeline.files import TarWriter
+def sharded(path: Path, per_shard: int = 4, **inputs: int) -> tuple[dict[str, FakeArtifact], Artifact]:
+    """The inputs of *shard* and its artifact, committed to a store: ``per_shard`` scenes in a tar."""
     from stages.s05_shard import Shard, ShardConfig
 
-    inputs, stage, config = dataset_inputs(path), Shard(), ShardConfig()
-    worker = stage.open(config, inputs, {})
-    records = [(item.group, record) for item in stage.items(config, inputs) for record in stage.process(worker, item)]
-    draft = FakeArtifact(path / "shard", records)
-    (draft.path / "parts").mkdir()
-    for split in ("train", "test"):
-        with open(draft.path / "parts" / f"{split}.tar", "wb") as file:
-            tar = TarWriter(file)
-            for id in draft.ids(split):
-                for name, data in draft.read(id).members.items():
-                    tar.add(f"{id}.{name}", data)
-            tar.close()
+    made, stage, config = dataset_inputs(path, **inputs), Shard(), ShardConfig()
+    return made, commit_shards(path / "store", made, stage, config, per_shard)
+
+
+def commit_shards(root: Path, inputs: dict, stage, config, per_shard: int) -> Artifact:
+    store, worker = Store(root), stage.open(config, inputs, {})
+    preimage = {"stage": "shard", "version": stage.version, "params": config.model_dump(mode="json"), "inputs": {}}
+    draft = store.draft("shard", digest_of(preimage), preimage)
+    items = sorted(stage.items(config, inputs), key=lambda item: (item.group, item.id))
+    markers = []
+    for group in sorted({item.group for item in items}):
+        mine = [item for item in items if item.group == group]
+        for first in range(0, len(mine), per_shard):
+            part = draft.open_part()
+            for item in mine[first : first + per_shard]:
+                for record in stage.process(worker, item):
+                    part.add(record, item.id, group, "")
+            ids = [item.id for item in mine[first : first + per_shard]]
+            markers.append({"part_key": str(len(markers)), "group": group, "items": ids, "rejects": [], **part.close()})
+    draft.use_parts(markers)
     stage.finish(config, inputs, draft)
     stage.check(draft)
-    return inputs, draft
+    manifest = {"key": draft.key, "preimage": preimage, "outputs": draft.outputs(), "summary": draft.summary, "finished": 0.0}
+    return store.commit(draft, stage.slug(config), manifest)

@@ -15,14 +15,15 @@ import pytest
 from pipeline.config import parse
 from pipeline.errors import UserError
 from pipeline.stage import Record
-from stages.arrays import unpack_json
+from stages.arrays import pack_json, unpack_json
+from stages.dataset.encoding import encode_scene
 from stages.evaluation.baselines import best_constants, mean_images, measure_baseline
 from stages.evaluation.report import loss_curve, markdown
 from stages.evaluation.statistics import JUDGED, METHODS, bootstrap, summarise, worst_first
 from stages.exr import decode_rgb, encode_view
 from stages.metrics import METRICS, log_error, measure_all
 from stages.records import SceneRecord, ViewRecord
-from stages.s07_evaluate import Evaluate, EvaluateConfig, training_images
+from stages.s07_evaluate import Evaluate, EvaluateConfig, report_facts, training_images
 from stages.tonemap import clamp
 from tests.stages.fakes import FakeArtifact
 
@@ -161,7 +162,7 @@ def shard_record(name: str, rng: np.random.Generator, cameras: list[int], lights
         light_index, np.zeros(n), np.tile(np.eye(4), (4, 1, 1)), np.full(4, 45.0), meta,
     )  # fmt: skip
     base = np.linspace(0.1, 1.2, SIZE)[:, None, None] * rng.uniform(0.3, 1, 3)
-    members = dict(made.to_record().members)
+    members = {"scene.npz": encode_scene(made), "meta.json": pack_json(meta)}
     for camera in cameras:
         layers = (base + hdr(rng, lights, SIZE, SIZE, 3) * 0.1).astype(np.float32) / lights
         flat = np.zeros((SIZE, SIZE, 3), np.float32)
@@ -169,7 +170,7 @@ def shard_record(name: str, rng: np.random.Generator, cameras: list[int], lights
         view = ViewRecord(
             layers, layers.sum(axis=0) * 0.6, flat, flat, flat[..., 0], flat[..., 0], nothing, nothing, {"index": camera}
         )
-        members[f"view{camera}.exr"] = encode_view(view)
+        members |= encode_view(view)
     return Record(name, members)
 
 
@@ -288,6 +289,18 @@ def test_a_diverged_model_stops_the_run(inputs, predictor, tmp_path):
 def test_mean_image_sees_training_scenes_only_and_about_as_many_as_asked(inputs):
     assert sum(len(block) for block in training_images(inputs["shard"], 1000)) == 24
     assert sum(len(block) for block in training_images(inputs["shard"], 8)) == 8
+
+
+def test_without_training_scenes_the_mean_image_is_that_of_the_others_and_the_report_says_so(inputs):
+    only_test = Artifact(inputs["shard"].path, [("test", inputs["shard"].read(id)) for id in inputs["shard"].ids("test")])
+    assert sum(len(block) for block in training_images(only_test, 1000)) == 6
+    summary = {
+        "train": dict(layers=1, view_layers=1, width=8, parameters=1, steps=0, key="a"),
+        "data": {"key": "b", "split": "test"},
+    }
+    for scenes, told in (({"test": 3}, True), ({"train": 6, "test": 3}, False)):
+        summary["data"]["scenes"] = scenes
+        assert ("mean training image" in report_facts(summary, 16, "c")) == told
 
 
 def test_a_split_without_scenes_is_named(inputs):

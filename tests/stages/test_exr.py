@@ -6,7 +6,20 @@ import numpy as np
 import pytest
 
 from pipeline.errors import UserError
-from stages.exr import HALF_MAX, clamped_values, decode_rgb, decode_view, encode_rgb, encode_view, read_rgb, write_rgb
+from stages.exr import (
+    HALF_MAX,
+    LAYERS,
+    clamped_values,
+    decode_layers,
+    decode_lights,
+    decode_rgb,
+    decode_view,
+    encode_rgb,
+    encode_view,
+    read_rgb,
+    size_of,
+    write_rgb,
+)
 from stages.records import ViewRecord
 
 
@@ -29,14 +42,29 @@ def a_view(lights: int = 10, size: int = 6) -> ViewRecord:
 @pytest.mark.parametrize("lights", [0, 1, 10])
 def test_view_survives_as_half_floats(lights):
     view = a_view(lights)
-    back = decode_view(encode_view(view))
+    back = decode_view(encode_view(view), 2)
     for name in ("lights", "direct", "albedo", "normal", "depth", "coverage"):
         expected = getattr(view, name).astype(np.float16).astype(np.float32)
         assert getattr(back, name).dtype == np.float32
         assert np.array_equal(getattr(back, name), expected), name
     for name in ("triangle", "object"):
         assert getattr(back, name).dtype == np.int32 and np.array_equal(getattr(back, name), getattr(view, name)), name
-    assert back.meta == view.meta
+    assert back.meta == view.meta and size_of(encode_view(view)["view2.exr"]) == (6, 6)
+
+
+def test_the_image_is_read_without_its_aovs_and_indices_survive():
+    view = a_view(2)
+    view.triangle = np.array([[-1, 70000], [0, 5]], np.int32).repeat(3, axis=0).repeat(3, axis=1)
+    members = encode_view(view)
+    assert sorted(members) == ["view2.aov.exr", "view2.exr"]
+    lights, meta = decode_lights(members["view2.exr"])
+    assert lights.shape == (2, 6, 6, 3) and meta == view.meta
+    layers = decode_layers(members["view2.aov.exr"])
+    assert layers.keys() == LAYERS.keys() and layers["normal"].shape == (6, 6, 3) and layers["depth"].shape == (6, 6)
+    assert layers["triangle"].dtype == np.int32 and np.array_equal(layers["triangle"], view.triangle)
+    for name, other in ((b"normal.Z", b"normal.Q"), (b"object.id", b"object.ix")):
+        with pytest.raises(UserError, match=f"has no channel {name.decode()}"):
+            decode_layers(members["view2.aov.exr"].replace(name, other))
 
 
 def test_same_view_gives_the_same_bytes():
@@ -47,7 +75,7 @@ def test_values_beyond_half_floats_are_clamped_and_counted():
     view = a_view(2)
     view.lights[0, 0, 0] = 1e6
     assert clamped_values(view) == 3
-    assert decode_view(encode_view(view)).lights.max() == HALF_MAX
+    assert decode_view(encode_view(view), 2).lights.max() == HALF_MAX
 
 
 def test_rgb_image_is_exact(tmp_path):
@@ -62,7 +90,7 @@ def test_rgb_image_is_exact(tmp_path):
 
 def test_a_view_reads_as_the_sum_of_its_lights():
     view = a_view()
-    assert np.allclose(decode_rgb(encode_view(view)), view.image, rtol=2e-3)
+    assert np.allclose(decode_rgb(encode_view(view)["view2.exr"]), view.image, rtol=2e-3)
 
 
 def test_what_is_no_image_is_refused_by_name(tmp_path):
@@ -72,6 +100,6 @@ def test_what_is_no_image_is_refused_by_name(tmp_path):
     with pytest.raises(UserError, match="missing.exr cannot be read"):
         read_rgb(tmp_path / "missing.exr")
     with pytest.raises(UserError, match="not a view"):
-        decode_view(encode_rgb(np.zeros((2, 2, 3))), "that")
+        decode_lights(encode_rgb(np.zeros((2, 2, 3))), "that")
     with pytest.raises(UserError, match="existing folder"):
         write_rgb(tmp_path / "no" / "a.exr", np.zeros((2, 2, 3)))

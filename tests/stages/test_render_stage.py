@@ -13,7 +13,7 @@ from pipeline import commands
 from pipeline.errors import Reject, UserError
 from pipeline.stage import Item, Record
 from stages.arrays import pack_json, unpack_json
-from stages.exr import decode_view, encode_view
+from stages.exr import decode_view, encode_view, view_members
 from stages.metrics import log_error, psnr
 from stages.records import ViewRecord
 from stages.rendering import noise, sheet
@@ -61,12 +61,12 @@ def test_stage_renders_drops_and_rejects(tmp_path):
     assert item == Item("good", "train", (("scene", "good"),))
     worker = stage.open(config, inputs, SCALAR)
     (record,) = stage.process(worker, item)
-    assert sorted(record.members) == ["meta.json", "view0.exr"]
+    assert sorted(record.members) == ["meta.json", "view0.aov.exr", "view0.exr"]
     meta = unpack_json(record.members["meta.json"])
     assert {name: meta[name] for name in meta if name != "views"} == {"template": "floor", "variant": "multi", "lights": 2}
     assert [view["status"] for view in meta["views"]] == ["ok", "dark", "too_close"]
     assert [view["index"] for view in meta["views"] if "noise" in view] == [0]  # nobody asks for the noise of what is dropped
-    assert decode_view(record.members["view0.exr"]).lights.shape == (2, 16, 16, 3)
+    assert decode_view(record.members, 0).lights.shape == (2, 16, 16, 3)
     with pytest.raises(Reject) as caught:
         list(stage.process(worker, dark_item))
     assert caught.value.reason == "dark"
@@ -98,7 +98,10 @@ def test_summary_tells_samples_errors_and_the_noise_floor(tmp_path, capsys):
     )
     records = []
     for id, views in metas.items():
-        members = {f"view{told['index']}.exr": image for told in views if told["status"] == "ok"}
+        members = {}
+        for told in views:
+            if told["status"] == "ok":
+                members |= dict(zip(view_members(told["index"]), image.values(), strict=True))
         views = [{**told, "mean": 0.001} for told in views]
         noted = {"template": "wall", "variant": "single", "lights": 1, "views": views}
         records.append(("train", Record(id, {**members, "meta.json": pack_json(noted)})))
@@ -129,7 +132,7 @@ def test_pairs_change_no_image_and_are_the_same_on_every_run(tmp_path):
     without, _ = rendered(tmp_path / "c", [scene], noise_share=0)
     assert first.read("test").members == again.read("test").members
     for index in (0, 1):
-        a, b = (decode_view(made.read("test").members[f"view{index}.exr"]) for made in (first, without))
+        a, b = (decode_view(made.read("test").members, index) for made in (first, without))
         assert (a.lights == b.lights).all()
         assert a.meta.pop("noise") and a.meta == b.meta
     Render().finish(config, {}, first)
@@ -215,7 +218,7 @@ def made_up(id, *, variant="single", lights=2, side=16, statuses=("ok", "dark", 
             colour = np.full((side, side, 3), 0.1 * (index + 1), np.float32)
             found = np.arange(flat.size, dtype=np.int32).reshape(flat.shape) - 1
             view = ViewRecord(np.stack([colour] * lights), colour, colour, colour, flat, flat, found, found, meta)
-            members[f"view{index}.exr"] = encode_view(view)
+            members |= encode_view(view)
     noted = {"template": template, "variant": variant, "lights": lights, "views": metas}
     return Record(id, {**members, "meta.json": pack_json(noted)})
 
@@ -240,7 +243,8 @@ def test_sheets_read_a_few_scenes_of_a_large_dataset(tmp_path):
         "contact-floor.png", "contact-wall.png", "layers-floor.png", "layers-wall.png",
     ]  # fmt: skip
     assert len({id for id, _ in read.log}) == sheet.SCENES + 1
-    assert all(len(names) == 1 for _, names in read.log)
+    # of all but the scenes on the layer sheets, the image alone
+    assert sum(names[-1].endswith(".aov.exr") for _, names in read.log) == 2
     assert sheet.choose(ids) == sheet.choose(ids[::-1])  # the order does not matter ...
     assert len(set(sheet.choose(ids)) & set(sheet.choose(ids + [f"t{number}" for number in range(20)]))) >= 5  # nor growth
 

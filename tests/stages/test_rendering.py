@@ -96,7 +96,7 @@ def clutter(lights=3, cameras=2):
 
 
 def hashed(views):
-    return [hashlib.sha256(encode_view(view)).hexdigest() for view in views]
+    return [hashlib.sha256(b"".join(encode_view(view).values())).hexdigest() for view in views]
 
 
 # --- against what is known --------------------------------------------------------------------------------------------

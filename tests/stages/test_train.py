@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
-from fakes import FakeArtifact, dataset_inputs
+from fakes import FakeArtifact, sharded
 
 from pipeline.errors import UserError
+from stages.dataset import decode_sample
 from stages.predict import load_model, predict, predict_scene
-from stages.records import SceneRecord
 from stages.s06_train import ModelSection, Train, TrainConfig
 
 MODEL = dict(
@@ -28,21 +27,8 @@ def config(**fields) -> TrainConfig:
 
 @pytest.fixture(scope="module")
 def shard(tmp_path_factory):
-    """A *shard* artifact of 16 px images whose test scenes serve as validation."""
-    from stages.s05_shard import Shard, ShardConfig
-
-    path = tmp_path_factory.mktemp("train")
-    inputs, stage = dataset_inputs(path, size=16), Shard()
-    worker = stage.open(ShardConfig(), inputs, {})
-    records = [
-        ("validation" if item.group == "test" else item.group, record)
-        for item in stage.items(ShardConfig(), inputs)
-        for record in stage.process(worker, item)
-    ]
-    artifact = FakeArtifact(path / "shard", records)
-    counts = {record.id: {"triangles": len(SceneRecord.from_record(record).triangles)} for _, record in records}
-    artifact.file("index.json").write_text(json.dumps(counts))
-    return artifact
+    """A *shard* artifact of 16 px images."""
+    return sharded(tmp_path_factory.mktemp("train"), size=16, validation=2)[1]
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +45,7 @@ def test_products(trained, shard):
     assert all((draft.files / name).is_file() for name in [*products, "log.jsonl", "curve.png"])
     assert draft.notes["training"]["steps"] == 4
     sample = shard.ids("validation")[0]
-    scene = SceneRecord.from_record(shard.read(sample))
+    scene = decode_sample(shard.read(sample)).scene
     images = predict_scene(load_model(draft.files / "checkpoint"), scene, [0, 2], 16)
     assert images.shape == (2, 16, 16, 3) and images.dtype == np.float32 and (images >= 0).all()
 
