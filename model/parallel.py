@@ -80,7 +80,7 @@ def distribute(model: RenderFormer, group: Group, sharded: bool) -> nn.Module:
 
         for layer in model.layers():
             fully_shard(layer)
-        return fully_shard(model)
+        return fully_shard(model, reshard_after_forward=True)  # else validation, without a backward, would leave it whole
     from torch.nn.parallel import DistributedDataParallel
 
     devices = [group.device] if group.device.type == "cuda" else None

@@ -212,7 +212,7 @@ class ViewTransformer(nn.Module):
         activated = F.elu(image, alpha=1e-3)
         if self.training and self.gradient_leak:  # same value, more gradient where the output is negative
             activated = activated + self.gradient_leak * (image - image.detach()) * (image < 0)
-        return activated.permute(0, 2, 3, 1).unflatten(0, (batch, views))
+        return activated.permute(0, 2, 3, 1).unflatten(0, (batch, views)).contiguous()
 
     def camera_points(self, tokens: Tokens, camera_to_world: Tensor) -> Tensor:
         """(V, S, 9): the tokens' positions as the view stage sees them, in each of their scene's V cameras or in the world."""
