@@ -22,6 +22,19 @@ if TYPE_CHECKING:
 RELEASED_TRIANGLES = 4096  # most triangles of the released training data, for checkpoints that do not say (section 2)
 
 
+PRETRAINED = Path(__file__).resolve().parents[1] / "model" / "pretrained"  # the checkpoint that ships, if one does
+
+
+def shipped_checkpoint() -> Path:
+    """The folder of the model that ships with the project."""
+    if not (PRETRAINED / "config.json").is_file():
+        raise UserError(
+            "no model ships with this version: train one (`make train`) and give --checkpoint train, or give "
+            "--checkpoint FOLDER with a released checkpoint (config.json, model.safetensors)"
+        )
+    return PRETRAINED
+
+
 def load_model(folder: Path) -> RenderFormer:
     """The network of a released-format checkpoint folder, in eval mode on the CPU."""
     from model import checkpoint
