@@ -3,6 +3,7 @@
     python bench/model.py        # 205M, 256 px, 1,536 triangles, 4 views of one scene, fp32, against the plain path
     python bench/model.py --models tiny,143m,base --triangles 768,1536,4096 --resolutions 256,512 --views 1,4
     python bench/model.py --train --precisions fp32,mixed,bf16 --scenes 4 [--compile] [--recompute]
+    python bench/model.py --attention     # ways to attend within scenes of different size
 
 Random triangles and weights; every row in a fresh process, best of several repeats. "of mm": floating-point operations of
 matrix products, convolutions and attention (``model.flops``) per second, over those of a large ``torch.mm`` of the same
@@ -23,6 +24,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -42,6 +44,12 @@ MM = {"cpu": 4096, "cuda": 8192}  # side of the large matrices
 
 
 clock = time.perf_counter
+
+
+def use_clock(name: str) -> None:
+    """wall, or cpu: the processor time of this process."""
+    global clock
+    clock = time.process_time if name == "cpu" else time.perf_counter
 
 
 def wait(device: str) -> None:
@@ -96,9 +104,7 @@ class Parts:
 
 def one(setup: dict[str, Any]) -> dict[str, Any]:
     """One row: a model, a scene size, a precision."""
-    global clock
-    if setup["clock"] == "cpu":
-        clock = time.process_time
+    use_clock(setup["clock"])
     torch.manual_seed(0)
     device, precision = setup["device"], setup["precision"]
     if setup["threads"]:
@@ -189,6 +195,56 @@ def one(setup: dict[str, Any]) -> dict[str, Any]:
     return row | ({"plain": best_plain, "difference": difference, "spread": spread} if setup["plain"] else {})
 
 
+def attention(arguments: argparse.Namespace) -> int:
+    """Self-attention of eight scenes of 384 to 1,536 tokens, 6 heads of 128 channels, in every way that this device runs."""
+    use_clock(arguments.clock)
+    if arguments.threads:
+        torch.set_num_threads(arguments.threads)
+    device, lengths = arguments.device, np.linspace(384, 1536, 8).astype(int).tolist()
+    longest = max(lengths)
+    print(
+        f"attention within {len(lengths)} scenes of {lengths[0]:,} to {longest:,} tokens on {device}, ms, "
+        f"best of {arguments.repeats}"
+    )
+    segments = layers.Segments(lengths)
+    for dtype in (torch.float32, torch.bfloat16):
+        torch.manual_seed(0)
+        packed = [torch.randn(6, sum(lengths), 128, device=device, dtype=dtype) for _ in range(3)]
+        mask = (torch.arange(longest) < torch.tensor(lengths)[:, None])[:, None, None].to(device)
+        padded = [
+            torch.stack([torch.nn.functional.pad(part, (0, 0, 0, longest - part.shape[1])) for part in segments.split(x, 1)])
+            for x in packed
+        ]
+        jagged = [
+            torch.nested.nested_tensor([part.transpose(0, 1) for part in segments.split(x, 1)], layout=torch.jagged).transpose(
+                1, 2
+            )
+            for x in packed
+        ]
+        offsets = torch.tensor([0, *np.cumsum(lengths)], dtype=torch.int32, device=device)
+
+        def varlen(packed=packed, offsets=offsets) -> torch.Tensor:
+            from torch.nn.attention.varlen import varlen_attn
+
+            q, k, v = (x.transpose(0, 1).contiguous() for x in packed)
+            return varlen_attn(q, k, v, offsets, offsets, longest, longest)
+
+        ways: dict[str, Callable[[], torch.Tensor]] = {
+            "scene by scene, no mask (what is used)": lambda p=packed, s=segments: layers.attend_packed(*p, s),
+            "padded, keys masked": lambda p=padded, m=mask: layers.attend(*p, m),
+            "jagged nested tensors": lambda j=jagged: layers.attend(*j),
+            "variable-length kernel": varlen,
+        }
+        for name, way in ways.items():
+            try:
+                way()
+                best = min(timed(way, device)[0] for _ in range(arguments.repeats))
+                print(f"  {str(dtype).removeprefix('torch.'):<9} {name:<40} {1000 * best:8.1f}")
+            except (RuntimeError, NotImplementedError, ImportError, AssertionError) as error:
+                print(f"  {str(dtype).removeprefix('torch.'):<9} {name:<40} not here: {str(error).splitlines()[0][:60]}")
+    return 0
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     listed = {"models": "base", "triangles": "1536", "resolutions": "256", "views": "4", "precisions": "fp32"}
@@ -198,11 +254,14 @@ def main() -> int:
     parser.add_argument("--train", action="store_true", help="a training step instead of a forward pass")
     parser.add_argument("--compile", action="store_true", help="torch.compile")
     parser.add_argument("--recompute", action="store_true", help="activation checkpointing")
+    parser.add_argument("--attention", action="store_true", help="compare ways to compute attention, and stop")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--threads", type=int, default=0, help="CPU threads (default: torch's choice)")
     parser.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="cpu: for a busy machine, with --threads 1")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     arguments = parser.parse_args()
+    if arguments.attention:
+        return attention(arguments)
     choices = [getattr(arguments, name).split(",") for name in listed]
     # The plain path is compared where the question is one of speed alone: one forward pass in float32.
     plain = not arguments.train and all(len(choice) == 1 for choice in choices) and arguments.precisions == "fp32"

@@ -353,10 +353,10 @@ class RenderFormer(nn.Module):
         """Every transformer layer of both stages: the units of compilation, recomputation and sharding."""
         return [*self.transformer.layers, *self.view_transformer.transformer.layers]
 
-    def compile_layers(self) -> None:
-        """``torch.compile`` for the layers, in place: two small graphs for all of them, whatever the number of triangles."""
+    def compile_layers(self, backend: str = "inductor") -> None:
+        """``torch.compile`` for the layers, in place: a few small graphs for all of them, whatever the number of triangles."""
         for layer in self.layers():
-            layer.compile()
+            layer.compile(backend=backend)
 
     def activation_checkpointing(self, on: bool = True) -> None:
         """Keep only the layers' inputs for the backward pass and compute the rest again: same result, less memory."""

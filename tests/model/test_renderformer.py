@@ -157,6 +157,22 @@ def test_activation_checkpointing_changes_neither_value_nor_gradient():
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
+def test_compiled_layers_are_compiled_once_for_scenes_of_any_size():
+    """Else a run would compile at every step. Traced only: what the backend makes of the graphs is torch's matter."""
+    from torch._dynamo.utils import counters
+
+    plain, compiled = build(num_layers=2), build(num_layers=2)
+    compiled.compile_layers("eager")
+    graphs = []
+    for triangles, padded, scenes in ((12, 0, 2), (20, 3, 2), (33, 5, 3), (41, 1, 4), (52, 2, 2)):
+        sizes = {"triangles": triangles, "padded": padded, "scenes": scenes}
+        scene, cameras, fov = inputs(plain, **sizes)
+        y = [model(scene, cameras, fov, RESOLUTION).detach() for model in (plain, compiled)]
+        torch.testing.assert_close(*y, atol=1e-6, rtol=1e-5)
+        graphs.append(counters["stats"]["unique_graphs"])
+    assert 0 < graphs[0] and graphs[2] == graphs[3] == graphs[4]
+
+
 @pytest.mark.parametrize("precision", ["mixed", "bf16"])
 def test_lower_precision_stays_near(precision):
     """bfloat16 has 8 bits: outputs differ by about a hundredth, positions and angles must not."""
