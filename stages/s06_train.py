@@ -113,6 +113,7 @@ class TrainConfig(StageConfig):
     log_every: int = runtime(50, ge=1)  # steps
     validate_every: int = runtime(200, ge=1)
     validation_scenes: int = runtime(16, ge=1)
+    validate_on: Literal["validation", "train"] = runtime("validation")  # train: how well it fits what it sees
     pictures: int = runtime(6, ge=0)  # validation scenes that are shown
     checkpoint_every: int = runtime(100, ge=1)
     tensorboard: bool = runtime(True)  # events besides log.jsonl
@@ -188,7 +189,9 @@ class Train(RunStage):
         if config.threads is not None:
             torch.set_num_threads(config.threads)
         train = ShardDataset(inputs["shard"], "train", config.max_triangles)
-        validation = ShardDataset(inputs["shard"], "validation", config.max_triangles)
+        validation = train
+        if config.validate_on != "train":
+            validation = ShardDataset(inputs["shard"], config.validate_on, config.max_triangles)
         batches = Batches(train, config.batches(), group.rank, group.world)
         held_out = list(itertools.islice(evaluation_samples(validation), config.validation_scenes))
 
