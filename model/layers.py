@@ -21,6 +21,13 @@ Rotation = tuple[Tensor, Tensor]  # cos and sin, each (..., tokens, head_dim / 2
 KeysValues = tuple[Tensor, Tensor]  # of the cross-attention, each (V or 1, heads, S, head_dim)
 
 
+class RMSNorm(nn.RMSNorm):
+    """In the weight's float32 also where autocast made the input bfloat16: exact, and fused into one kernel."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x.to(self.weight.dtype))
+
+
 def sinusoids(x: Tensor, n_freqs: int) -> Tensor:
     """(..., C) -> (..., C (1 + 2 n)): x, sin(f x), sin(f x + pi/2) for f = 2^0..2^(n-1), each value-major."""
     freqs = 2.0 ** torch.arange(n_freqs, device=x.device, dtype=x.dtype)
@@ -117,8 +124,8 @@ class SelfAttention(nn.Module):
         super().__init__()
         self.heads = heads
         self.in_proj = nn.Linear(dim, 3 * dim, bias=False)
-        self.q_norm = nn.RMSNorm(dim, LAYER_EPS)
-        self.k_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.q_norm = RMSNorm(dim, LAYER_EPS)
+        self.k_norm = RMSNorm(dim, LAYER_EPS)
         self.out_proj = nn.Linear(dim, dim, bias=False)
 
     def forward(
@@ -144,8 +151,8 @@ class CrossAttention(nn.Module):
         self.q_proj = nn.Linear(dim, dim, bias=False)
         self.k_proj = nn.Linear(dim, dim, bias=False)
         self.v_proj = nn.Linear(dim, dim, bias=False)
-        self.q_norm = nn.RMSNorm(dim, LAYER_EPS)
-        self.k_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.q_norm = RMSNorm(dim, LAYER_EPS)
+        self.k_norm = RMSNorm(dim, LAYER_EPS)
         self.out_proj = nn.Linear(dim, dim, bias=False)
 
     def keys_values(self, tokens: Tensor) -> KeysValues:
@@ -179,9 +186,9 @@ class EncoderLayer(nn.Module):
 
     def __init__(self, dim: int, heads: int, hidden: int):
         super().__init__()
-        self.query_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.query_norm = RMSNorm(dim, LAYER_EPS)
         self.multihead_attn = SelfAttention(dim, heads)
-        self.ffn_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.ffn_norm = RMSNorm(dim, LAYER_EPS)
         self.ffn = FeedForward(dim, hidden)
 
     def forward(self, x: Tensor, rotation: Rotation | None, segments: Segments) -> Tensor:
@@ -227,15 +234,15 @@ class DecoderLayer(nn.Module):
 
     def __init__(self, dim: int, heads: int, hidden: int, self_attention: bool):
         super().__init__()
-        self.query_norm = nn.RMSNorm(dim, LAYER_EPS)
-        self.kv_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.query_norm = RMSNorm(dim, LAYER_EPS)
+        self.kv_norm = RMSNorm(dim, LAYER_EPS)
         self.multihead_attn = CrossAttention(dim, heads)
         if self_attention:
-            self.self_attn_norm = nn.RMSNorm(dim, LAYER_EPS)
+            self.self_attn_norm = RMSNorm(dim, LAYER_EPS)
             self.self_attn = SelfAttention(dim, heads)
         else:
             self.self_attn = None
-        self.ffn_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.ffn_norm = RMSNorm(dim, LAYER_EPS)
         self.ffn = FeedForward(dim, hidden)
 
     def keys_values(self, tokens: Tensor) -> KeysValues:

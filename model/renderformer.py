@@ -27,6 +27,7 @@ from model.layers import (
     DecoderLayer,
     EncoderLayer,
     KeysValues,
+    RMSNorm,
     RotaryFrequencies,
     Rotation,
     Segments,
@@ -137,10 +138,10 @@ class ViewTransformer(nn.Module):
         dim, pixels = config.latent_dim, 3 * config.patch_size**2
         self.ray_map_patch_token = nn.Parameter(torch.randn(1, 1, dim) * 0.02)
         self.ray_map_encoder = nn.Linear(pixels, dim)
-        self.ray_map_encoder_norm = nn.RMSNorm(dim, EMBEDDING_EPS)
+        self.ray_map_encoder_norm = RMSNorm(dim, EMBEDDING_EPS)
         if config.pe_type == "nerf":
             self.pe_token_proj = nn.Linear(9 * (1 + 2 * config.vertex_pe_num_freqs), dim)
-            self.token_pos_pe_norm = nn.RMSNorm(dim, EMBEDDING_EPS)
+            self.token_pos_pe_norm = RMSNorm(dim, EMBEDDING_EPS)
         self.transformer = Decoder(config)
         if config.use_dpt_decoder:
             self.out_dpt = DPTHead(dim, config.dpt_features, config.dpt_out_channels, config.patch_size)
@@ -247,12 +248,12 @@ class RenderFormer(nn.Module):
         if config.num_register_tokens:
             self.reg_tokens = nn.Parameter(torch.randn(1, config.num_register_tokens, dim) * 0.02)
         self.texture_encoder = nn.Linear(config.texture_channels * config.texture_encode_patch_size**2, dim)
-        self.texture_encoder_norm = nn.RMSNorm(dim, EMBEDDING_EPS)
+        self.texture_encoder_norm = RMSNorm(dim, EMBEDDING_EPS)
         self.vn_encoding_proj = nn.Linear(9 * (1 + 2 * config.vn_pe_num_freqs), dim)
-        self.vn_encoder_norm = nn.RMSNorm(dim, EMBEDDING_EPS)
+        self.vn_encoder_norm = RMSNorm(dim, EMBEDDING_EPS)
         if config.pe_type == "nerf":
             self.tri_encoding_proj = nn.Linear(9 * (1 + 2 * config.vertex_pe_num_freqs), dim)
-            self.tri_encoding_norm = nn.RMSNorm(dim, EMBEDDING_EPS)
+            self.tri_encoding_norm = RMSNorm(dim, EMBEDDING_EPS)
         self.transformer = Encoder(config)
         self.view_transformer = ViewTransformer(config)
 
