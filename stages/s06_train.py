@@ -317,16 +317,23 @@ def estimate(config: TrainConfig, configs: Mapping[str, StageConfig]) -> list[st
 
 
 def plot_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:
-    """Training loss and validation error over steps."""
+    """Training loss and validation error over steps on the left, validation PSNR on the right."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.add_subplot()
-    for key, label, style in (("loss", "training loss", "-"), ("validation_log_error", "validation, log error", "o-")):
+    right = axes.twinx()
+    lines = []
+    for where, key, label, style in (
+        (axes, "loss", "training loss", "C0-"),
+        (axes, "validation_log_error", "validation, log error", "C1o-"),
+        (right, "validation_psnr", "validation, PSNR", "C2.--"),
+    ):
         points = [(row["step"], row[key]) for row in rows if row.get(key) is not None]
         if points:
-            axes.plot(*zip(*points, strict=True), style, label=label, markersize=3)
+            lines += where.plot(*zip(*points, strict=True), style, label=label, markersize=3, linewidth=1.2)
     axes.set(xlabel="step", ylabel="L1 of log10(1 + radiance)", title=title, yscale="log")
+    right.set(ylabel="PSNR (dB)")
     axes.grid(alpha=0.3, which="both")
-    axes.legend()
+    axes.legend(handles=lines)
     figure.savefig(path, dpi=120)
