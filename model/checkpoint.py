@@ -12,6 +12,7 @@ from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
 from model.config import ModelConfig
 from model.renderformer import RenderFormer
@@ -19,17 +20,19 @@ from model.renderformer import RenderFormer
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 
 
-def save(model: RenderFormer, folder: Path, trained_with: Mapping[str, str] | None = None) -> None:
-    """Write the folder; each file appears whole or not at all."""
+def save(
+    config: ModelConfig, weights: Mapping[str, Tensor], folder: Path, trained_with: Mapping[str, str] | None = None
+) -> None:
+    """Write the folder from a network's config and state dict; each file appears whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
-    state = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    state = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
     metadata = {"format": "pt", **(trained_with or {})}
     temporary = folder / (WEIGHTS + ".tmp")
     save_file(state, temporary, metadata)
     _sort_metadata(temporary)
     replace(temporary, folder / WEIGHTS)
     temporary = folder / (CONFIG + ".tmp")
-    temporary.write_text(model.config.dumps())
+    temporary.write_text(config.dumps())
     replace(temporary, folder / CONFIG)
 
 

@@ -15,6 +15,11 @@ def _resize(x: Tensor, size: tuple[int, int]) -> Tensor:
     return F.interpolate(x, size=size, mode="bilinear", align_corners=True)
 
 
+def pointwise(conv: nn.Conv2d, x: Tensor) -> Tensor:
+    """A 1 x 1 convolution as the matrix product that it is, which also keeps the layout of tokens, channels last."""
+    return F.linear(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
+
+
 class ResidualUnit(nn.Module):
     def __init__(self, features: int):
         super().__init__()
@@ -38,7 +43,7 @@ class FusionBlock(nn.Module):
     def forward(self, level: Tensor, path: Tensor | None, size: tuple[int, int]) -> Tensor:
         x = level if path is None else path + self.resConvUnit1(level)
         # A 1x1 convolution and an interpolation commute; before it, the convolution sees a quarter of the pixels.
-        return _resize(self.out_conv(self.resConvUnit2(x)), size)
+        return _resize(pointwise(self.out_conv, self.resConvUnit2(x)), size)
 
 
 class DPTHead(nn.Module):
@@ -67,11 +72,12 @@ class DPTHead(nn.Module):
         levels = []
         for i, tokens in enumerate(layers):
             grid = tokens.transpose(1, 2).unflatten(2, (h, w))
-            level = self.resize_layers[i](self.projects[i](grid))
+            level = self.resize_layers[i](pointwise(self.projects[i], grid))
             levels.append(getattr(self.scratch, f"layer{i + 1}_rn")(level))
         path = None
         for i in (3, 2, 1, 0):
             size = levels[i - 1].shape[-2:] if i else [2 * n for n in levels[0].shape[-2:]]
             path = getattr(self.scratch, f"refinenet{i + 1}")(levels[i], path, tuple(size))
         x = _resize(self.scratch.output_conv1(path), (h * self.patch_size, w * self.patch_size))
-        return self.scratch.output_conv2(x)
+        first, activation, last = self.scratch.output_conv2
+        return pointwise(last, activation(first(x)))

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import torch
 
-from model.renderformer import RenderFormer, kept_cells
+from model.inputs import kept_cells
+from model.renderformer import RenderFormer
 
 DIRECTION_GAIN = 3.0  # of a ray's mean direction in its embedding, beside a constant of 1
 NOISE = 0.3  # share of the default initial values that is kept for variety

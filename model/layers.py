@@ -1,12 +1,14 @@
 """The transformer's parts: encodings, rotary positions, attention, feed-forward (sections 3.1 and 3.2).
 
-Attribute names are the released parameter names, so a state dict *is* a released checkpoint. Attention runs through
-``scaled_dot_product_attention``, which picks the device's best kernel; masks are boolean, True where a key counts.
+Attribute names are the released parameter names, so a state dict *is* a released checkpoint. Scenes of different size are
+packed one after the other, never padded: every token is real, and attention runs scene by scene through
+``scaled_dot_product_attention`` without a mask, which leaves the choice of the fastest kernel to the device.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +18,14 @@ EMBEDDING_EPS = torch.finfo(torch.float32).eps  # RMSNorms of the texture, norma
 LAYER_EPS = 1e-6  # every other RMSNorm
 
 Rotation = tuple[Tensor, Tensor]  # cos and sin, each (..., tokens, head_dim / 2)
+KeysValues = tuple[Tensor, Tensor]  # of the cross-attention, each (V or 1, heads, S, head_dim)
+
+
+class RMSNorm(nn.RMSNorm):
+    """In the weight's float32 also where autocast made the input bfloat16: exact, and fused into one kernel."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x.to(self.weight.dtype))
 
 
 def sinusoids(x: Tensor, n_freqs: int) -> Tensor:
@@ -59,9 +69,52 @@ def merge_heads(x: Tensor) -> Tensor:
     return x.transpose(-3, -2).flatten(-2)
 
 
+class Segments:
+    """Where each of B sequences lies in a packed row of tokens: ``lengths``, in order.
+
+    A plain object on purpose: compiled layers hand it on without looking inside, so that other lengths do not compile again.
+    """
+
+    def __init__(self, lengths: Sequence[int]):
+        self.lengths = tuple(lengths)
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    def split(self, x: Tensor, dim: int) -> tuple[Tensor, ...]:
+        """One view per sequence."""
+        return x.split(self.lengths, dim)
+
+    def index(self, device: torch.device | None = None) -> Tensor:
+        """(S,) int64: which sequence each token belongs to."""
+        lengths = torch.tensor(self.lengths, device=device)
+        return torch.arange(len(self), device=device).repeat_interleave(lengths, output_size=sum(self.lengths))
+
+
 def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
     """Attention of (B, heads, Q, c) to (B, heads, K, c); the encodings may be float32 while the values are not."""
     return F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v, attn_mask=mask)
+
+
+@torch.compiler.disable
+def attend_packed(q: Tensor, k: Tensor, v: Tensor, segments: Segments) -> Tensor:
+    """Attention within each sequence of packed (heads, S, c) tokens.
+
+    One unmasked call per sequence: a mask, or padding, would keep the device from its fastest kernel and make it compute
+    what is thrown away, and sequences of a thousand tokens keep a device busy one by one.
+    """
+    parts = zip(*(segments.split(x, 1) for x in (q, k, v)), strict=True)
+    found = [attend(a[None], b[None], c[None])[0] for a, b, c in parts]
+    return found[0] if len(found) == 1 else torch.cat(found, dim=1)
+
+
+@torch.compiler.disable
+def attend_across(q: Tensor, k: Tensor, v: Tensor, segments: Segments) -> Tensor:
+    """Attention of rays (B V, heads, T, c) to their scene's packed tokens: k, v (V, heads, S, c), or 1 for V alike."""
+    views = len(q) // len(segments)
+    parts = zip(q.split(views), segments.split(k, 2), segments.split(v, 2), strict=True)
+    found = [attend(a, *(x.expand(views, -1, -1, -1) for x in (b, c))) for a, b, c in parts]
+    return found[0] if len(found) == 1 else torch.cat(found)
 
 
 class SelfAttention(nn.Module):
@@ -71,16 +124,22 @@ class SelfAttention(nn.Module):
         super().__init__()
         self.heads = heads
         self.in_proj = nn.Linear(dim, 3 * dim, bias=False)
-        self.q_norm = nn.RMSNorm(dim, LAYER_EPS)
-        self.k_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.q_norm = RMSNorm(dim, LAYER_EPS)
+        self.k_norm = RMSNorm(dim, LAYER_EPS)
         self.out_proj = nn.Linear(dim, dim, bias=False)
 
-    def forward(self, x: Tensor, rotation: Rotation | None = None, mask: Tensor | None = None) -> Tensor:
-        """x: (B, S, d); rotation: cos and sin (B, 1, S, c / 2); mask: (B, 1, 1, S), or (B, 1, S, S)."""
+    def forward(
+        self, x: Tensor, rotation: Rotation | None = None, segments: Segments | None = None, mask: Tensor | None = None
+    ) -> Tensor:
+        """x: packed (S, d) with ``segments``, or (B, S, d) with a mask (B, 1, S, S) or none.
+
+        rotation: cos and sin, (1, S, c / 2) or (B, 1, S, c / 2).
+        """
         q, k, v = self.in_proj(x).chunk(3, dim=-1)
         q = rotate(split_heads(self.q_norm(q), self.heads), rotation)
         k = rotate(split_heads(self.k_norm(k), self.heads), rotation)
-        return self.out_proj(merge_heads(attend(q, k, split_heads(v, self.heads), mask)))
+        v = split_heads(v, self.heads)
+        return self.out_proj(merge_heads(attend(q, k, v, mask) if segments is None else attend_packed(q, k, v, segments)))
 
 
 class CrossAttention(nn.Module):
@@ -92,18 +151,18 @@ class CrossAttention(nn.Module):
         self.q_proj = nn.Linear(dim, dim, bias=False)
         self.k_proj = nn.Linear(dim, dim, bias=False)
         self.v_proj = nn.Linear(dim, dim, bias=False)
-        self.q_norm = nn.RMSNorm(dim, LAYER_EPS)
-        self.k_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.q_norm = RMSNorm(dim, LAYER_EPS)
+        self.k_norm = RMSNorm(dim, LAYER_EPS)
         self.out_proj = nn.Linear(dim, dim, bias=False)
 
-    def keys_values(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, S, d) -> keys, not yet rotated, and values, each (B, heads, S, c)."""
+    def keys_values(self, tokens: Tensor) -> KeysValues:
+        """(V or 1, S, d), already normalised -> keys, not yet rotated, and values, each (V or 1, heads, S, c)."""
         return split_heads(self.k_norm(self.k_proj(tokens)), self.heads), split_heads(self.v_proj(tokens), self.heads)
 
-    def forward(self, x: Tensor, keys: Tensor, values: Tensor, rotation: Rotation | None, mask: Tensor | None) -> Tensor:
-        """x: (B, T, d) rays, already normalised; keys (rotated) and values: (B, heads, S, c); rotation: the rays'."""
+    def forward(self, x: Tensor, keys: Tensor, values: Tensor, rotation: Rotation | None, segments: Segments) -> Tensor:
+        """x: (B V, T, d) rays, already normalised; keys (rotated), values: (V or 1, heads, S, c); rotation: the rays'."""
         q = rotate(split_heads(self.q_norm(self.q_proj(x)), self.heads), rotation)
-        return self.out_proj(merge_heads(attend(q, keys, values, mask)))
+        return self.out_proj(merge_heads(attend_across(q, keys, values, segments)))
 
 
 class FeedForward(nn.Module):
@@ -116,7 +175,10 @@ class FeedForward(nn.Module):
         self.w3 = nn.Linear(dim, hidden, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.w2(F.silu(self.w1(x)) * self.w3(x))
+        if torch.is_grad_enabled():
+            return self.w2(F.silu(self.w1(x)) * self.w3(x))
+        hidden = self.w1(x)  # in place: fresh memory of this size costs a CPU as much time as the arithmetic
+        return self.w2(F.silu(hidden, inplace=True).mul_(self.w3(x)))
 
 
 class EncoderLayer(nn.Module):
@@ -124,13 +186,13 @@ class EncoderLayer(nn.Module):
 
     def __init__(self, dim: int, heads: int, hidden: int):
         super().__init__()
-        self.query_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.query_norm = RMSNorm(dim, LAYER_EPS)
         self.multihead_attn = SelfAttention(dim, heads)
-        self.ffn_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.ffn_norm = RMSNorm(dim, LAYER_EPS)
         self.ffn = FeedForward(dim, hidden)
 
-    def forward(self, x: Tensor, rotation: Rotation | None, mask: Tensor | None) -> Tensor:
-        x = x + self.multihead_attn(self.query_norm(x), rotation, mask)
+    def forward(self, x: Tensor, rotation: Rotation | None, segments: Segments) -> Tensor:
+        x = x + self.multihead_attn(self.query_norm(x), rotation, segments)
         return x + self.ffn(self.ffn_norm(x))
 
 
@@ -164,7 +226,7 @@ class Windows:
         batch, tokens, dim = x.shape
         windows = x[:, self.order].view(-1, self.SIZE**2, dim)
         mask = None if self.mask is None else self.mask.repeat(batch, 1, 1, 1)
-        return attention(windows, None, mask).view(batch, tokens, dim)[:, self.inverse]
+        return attention(windows, mask=mask).view(batch, tokens, dim)[:, self.inverse]
 
 
 class DecoderLayer(nn.Module):
@@ -172,21 +234,28 @@ class DecoderLayer(nn.Module):
 
     def __init__(self, dim: int, heads: int, hidden: int, self_attention: bool):
         super().__init__()
-        self.query_norm = nn.RMSNorm(dim, LAYER_EPS)
-        self.kv_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.query_norm = RMSNorm(dim, LAYER_EPS)
+        self.kv_norm = RMSNorm(dim, LAYER_EPS)
         self.multihead_attn = CrossAttention(dim, heads)
         if self_attention:
-            self.self_attn_norm = nn.RMSNorm(dim, LAYER_EPS)
+            self.self_attn_norm = RMSNorm(dim, LAYER_EPS)
             self.self_attn = SelfAttention(dim, heads)
         else:
             self.self_attn = None
-        self.ffn_norm = nn.RMSNorm(dim, LAYER_EPS)
+        self.ffn_norm = RMSNorm(dim, LAYER_EPS)
         self.ffn = FeedForward(dim, hidden)
 
+    def keys_values(self, tokens: Tensor) -> KeysValues:
+        """What the rays attend to, from the scenes' tokens (V or 1, S, d)."""
+        return self.multihead_attn.keys_values(self.kv_norm(tokens))
+
     def forward(
-        self, x: Tensor, keys: Tensor, values: Tensor, rotation: Rotation | None, mask: Tensor | None, windows: Windows | None
-    ) -> Tensor:
-        x = x + self.multihead_attn(self.query_norm(x), keys, values, rotation, mask)
+        self, x: Tensor, tokens: Tensor | KeysValues, key_rotation: Rotation | None, ray_rotation: Rotation | None,
+        segments: Segments, windows: Windows | None,
+    ) -> Tensor:  # fmt: skip
+        """x: (B V, T, d) rays; tokens: the scenes' (V or 1, S, d), or what ``keys_values`` made of them."""
+        keys, values = self.keys_values(tokens) if isinstance(tokens, Tensor) else tokens
+        x = x + self.multihead_attn(self.query_norm(x), rotate(keys, key_rotation), values, ray_rotation, segments)
         if self.self_attn is not None:
             # All rays of a view share one position, and rotary attention only sees differences: nothing to turn here.
             y = self.self_attn_norm(x)

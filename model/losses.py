@@ -7,6 +7,7 @@ torchvision's ImageNet network and the metric's linear layers. A weight of 0 nev
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import torch
@@ -35,6 +36,9 @@ NETWORKS = {
         "linear": ("alex.pth", "https://github.com/richzhang/PerceptualSimilarity/raw/master/lpips/weights/v0.1/alex.pth"),
     },
 }  # fmt: skip
+
+
+FOLDER_VARIABLE = "LIGHTMILL_LPIPS"  # where the weight files lie, if the config does not say
 
 
 def log_radiance(image: Tensor) -> Tensor:
@@ -72,13 +76,18 @@ class LPIPS(nn.Module):
 
     @classmethod
     def load(cls, folder: Path | None, network: str = "vgg") -> LPIPS:
-        """From the two published files in ``folder``; a missing one is an error that says where to get it."""
+        """From the two published files in ``folder``, or else in the one that LIGHTMILL_LPIPS names.
+
+        A missing file is an error that says where to get it.
+        """
         spec = NETWORKS[network]
+        if folder is None and os.environ.get(FOLDER_VARIABLE):
+            folder = Path(os.environ[FOLDER_VARIABLE]).expanduser()
         loaded = []
         for name, url in (spec["features"], spec["linear"]):
             path = None if folder is None else Path(folder) / name
             if path is None or not path.is_file():
-                where = "no folder is configured (lpips_folder)" if path is None else f"{path} does not exist"
+                where = f"no folder is named (lpips_folder, or {FOLDER_VARIABLE})" if path is None else f"{path} does not exist"
                 raise ValueError(f"LPIPS needs {name}, but {where}: get it from {url}, or train without it: lpips=0")
             loaded.append(torch.load(path, map_location="cpu", weights_only=True))
         features, linear = loaded

@@ -1,76 +1,51 @@
 """RenderFormer: triangles to tokens, ray bundles to pixels (sections 3.1 and 3.2).
 
-Computes exactly what the released checkpoints compute (``tests/parity.py``), with three shortcuts that change nothing:
-constant materials skip the patch, triangles' keys and values are projected once for all views of a scene, and rotary
-angles are computed once per stage. ``encode`` once and ``decode`` many views, or call the model for both.
+Computes exactly what the released checkpoints compute (``tests/parity.py``) and what ``model.reference`` spells out, with
+shortcuts that change nothing: constant materials skip the patch, scenes are packed without padding, position angles are
+computed once per stage, and the triangles' keys and values are projected once per layer for all views of a scene. ``encode``
+once and ``decode`` many views, call the model for both (training), or ``render`` (everything else).
 """
 
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from model.config import ModelConfig
 from model.dpt import DPTHead
+from model.inputs import Triangles, encode_emission, kept_cells, scenes_of
 from model.layers import (
     EMBEDDING_EPS,
     DecoderLayer,
     EncoderLayer,
+    KeysValues,
+    RMSNorm,
     RotaryFrequencies,
     Rotation,
+    Segments,
     Windows,
-    rotate,
     sinusoids,
 )
 
-PATCH_NORMAL = (0.5, 0.5, 1.0)  # the released format's constant tangent-space normal
-EMISSION = 3  # emission is the last three channels
-
 
 @dataclass
-class Triangles:
-    """A batch of scenes as the network reads them, padded to one triangle count.
+class Tokens:
+    """What the view-independent stage knows about B scenes: registers, then triangles, scene after scene.
 
-    triangles: (B, N, 3, 3) float32, world space. vertex_normals: (B, N, 3, 3).
-    material: (B, N, C) where every triangle is of one material, or patches (B, N, C, P, P); C = 13 channels (diffuse 3,
-        specular 3, roughness 1, normal 3, emission 3) or the 10 without the normal; emission as radiance.
-    mask: (B, N) bool, True where a triangle exists; None where all do.
+    x: (S, d). positions: (S, 9) float32, world: a triangle's vertices; a register's is the mean of all, three times.
     """
 
-    triangles: Tensor
-    vertex_normals: Tensor
-    material: Tensor
-    mask: Tensor | None = None
-
-
-def constant_material(diffuse: Tensor, specular: Tensor, roughness: Tensor, emission: Tensor, channels: int = 13) -> Tensor:
-    """(..., 3), (..., 3), (...), (..., 3) -> (..., channels) in the released order."""
-    parts = [diffuse, specular, roughness[..., None], emission]
-    if channels == 13:
-        parts.insert(3, diffuse.new_tensor(PATCH_NORMAL).expand(diffuse.shape))
-    return torch.cat(parts, dim=-1)
-
-
-def kept_cells(patch: int, device: torch.device | None = None) -> Tensor:
-    """(P, P) bool: the half of a patch that a triangle covers, x + y <= P."""
-    i = torch.arange(patch, device=device)
-    return i[:, None] + i[None, :] <= patch
-
-
-def material_patches(material: Tensor, patch: int) -> Tensor:
-    """Constant materials (..., C) as the released format stores them, (..., C, P, P): zero outside the triangle."""
-    return material[..., None, None] * kept_cells(patch, material.device).to(material.dtype)
-
-
-def encode_emission(material: Tensor, dim: int) -> Tensor:
-    """Emission enters as log10(1 + e); a new tensor, so that nothing is encoded twice."""
-    rest, emission = material.split([material.shape[dim] - EMISSION, EMISSION], dim=dim)
-    return torch.cat([rest, torch.log10(1 + emission)], dim=dim)
+    x: Tensor
+    positions: Tensor
+    segments: Segments
 
 
 def ray_directions(fov_deg: Tensor, height: int, width: int) -> Tensor:
@@ -105,6 +80,13 @@ def from_patches(tokens: Tensor, h: int, w: int, patch: int) -> Tensor:
     return grid.permute(0, 3, 1, 4, 2, 5).reshape(batch, 3, h * patch, w * patch)
 
 
+def run_layer(layer: nn.Module, *inputs: object) -> Tensor:
+    """The layer's output; where ``activation_checkpointing`` is on, inner results are computed again in the backward pass."""
+    if getattr(layer, "recompute", False) and torch.is_grad_enabled():
+        return checkpoint(layer, *inputs, use_reentrant=False)
+    return layer(*inputs)
+
+
 class Encoder(nn.Module):
     """The view-independent transformer; the frequencies are stored even with no layers."""
 
@@ -117,14 +99,14 @@ class Encoder(nn.Module):
         if config.pe_type == "rope":
             self.rope_emb = RotaryFrequencies(config.vertex_pe_num_freqs, config.rope_double_max_freq)
 
-    def forward(self, x: Tensor, positions: Tensor, mask: Tensor | None) -> Tensor:
-        """x: (B, S, d); positions: (B, S, 9); mask: (B, 1, 1, S)."""
+    def forward(self, x: Tensor, positions: Tensor, segments: Segments) -> Tensor:
+        """x: (S, d); positions: (S, 9)."""
         rotation = None
         if hasattr(self, "rope_emb") and len(self.layers):
             cos, sin = self.rope_emb(positions, self.head_dim)
-            rotation = cos[:, None], sin[:, None]
+            rotation = cos[None], sin[None]  # one for all heads, and for all layers
         for layer in self.layers:
-            x = layer(x, rotation, mask)
+            x = run_layer(layer, x, rotation, segments)
         return x
 
 
@@ -156,10 +138,10 @@ class ViewTransformer(nn.Module):
         dim, pixels = config.latent_dim, 3 * config.patch_size**2
         self.ray_map_patch_token = nn.Parameter(torch.randn(1, 1, dim) * 0.02)
         self.ray_map_encoder = nn.Linear(pixels, dim)
-        self.ray_map_encoder_norm = nn.RMSNorm(dim, EMBEDDING_EPS)
+        self.ray_map_encoder_norm = RMSNorm(dim, EMBEDDING_EPS)
         if config.pe_type == "nerf":
             self.pe_token_proj = nn.Linear(9 * (1 + 2 * config.vertex_pe_num_freqs), dim)
-            self.token_pos_pe_norm = nn.RMSNorm(dim, EMBEDDING_EPS)
+            self.token_pos_pe_norm = RMSNorm(dim, EMBEDDING_EPS)
         self.transformer = Decoder(config)
         if config.use_dpt_decoder:
             self.out_dpt = DPTHead(dim, config.dpt_features, config.dpt_out_channels, config.patch_size)
@@ -179,66 +161,80 @@ class ViewTransformer(nn.Module):
         return self.token_pos_pe_norm(self.pe_token_proj(sinusoids(positions, self.config.vertex_pe_num_freqs)))
 
     def forward(
-        self, tokens: Tensor, positions: Tensor, mask: Tensor | None, camera_to_world: Tensor, fov_deg: Tensor,
-        height: int, width: int,
+        self, tokens: Tokens, camera_to_world: Tensor, fov_deg: Tensor, height: int, width: int,
+        keys_values: Sequence[KeysValues] | None = None,
     ) -> Tensor:  # fmt: skip
-        """tokens: (B, S, d); positions: (B, S, 9) world; mask: (B, 1, 1, S); cameras (B, V, 4, 4), (B, V).
+        """Cameras (B, V, 4, 4), (B, V) -> (B, V, height, width, 3), log10(1 + radiance).
 
-        Returns (B, V, height, width, 3), log10(1 + radiance).
+        ``keys_values``: what ``project`` made of the tokens, if that was done before.
         """
         config = self.config
         batch, views = fov_deg.shape
         h, w = height // config.patch_size, width // config.patch_size
+        # Geometry in float32 and without matrix products, which TF32 or autocast would round.
         directions = ray_directions(fov_deg, height, width)  # (B, V, H, W, 3)
-        rotation_cw, origin = camera_to_world[..., :3, :3], camera_to_world[..., :3, 3]
-        points = positions.unflatten(-1, (3, 3))[:, None]  # (B, 1, S, 3 vertices, 3)
-        if config.turn_to_cam_coord:
-            # World to camera: p_c = R^T (p - o), as row vectors (p - o) R.
-            points = (points - origin[:, :, None, None]) @ rotation_cw[:, :, None]
-            origin = torch.zeros_like(origin)
-        else:
-            directions = directions @ rotation_cw[:, :, None].transpose(-1, -2)
-            points = points.expand(-1, views, -1, -1, -1)
-        points = points.flatten(-2)  # (B, V, S, 9)
-        origins = origin.repeat(1, 1, 3)[:, :, None]  # (B, V, 1, 9): every ray of a view starts at its camera
+        rotation_cw, origin = camera_to_world[..., :3, :3].float(), camera_to_world[..., :3, 3].float()
+        if not config.turn_to_cam_coord:
+            directions = (rotation_cw[:, :, None, None] * directions[..., None, :]).sum(dim=-1)
+        points = self.camera_points(tokens, camera_to_world)
+        # Every ray of a view starts at its camera: (B V, 1, 9), in the camera frame 0.
+        origins = (torch.zeros_like(origin) if config.turn_to_cam_coord else origin).repeat(1, 1, 3).view(-1, 1, 9)
 
         rays = to_patches(directions.flatten(0, 1), config.patch_size)
         x = self.ray_map_encoder_norm(self.ray_map_encoder(rays)) + self.ray_map_patch_token  # (B V, T, d)
-        if mask is not None:
-            mask = mask[:, None].expand(-1, views, -1, -1, -1).flatten(0, 1)
-
         key_rotation: Rotation | None = None
         ray_rotation: Rotation | None = None
         if config.pe_type == "rope":
-            head_dim = self.transformer.head_dim
-            cos, sin = self.transformer.rope_emb(points, head_dim)
-            key_rotation = cos[:, :, None], sin[:, :, None]  # (B, V, 1, S, c / 2)
+            cos, sin = self.transformer.rope_emb(points, self.transformer.head_dim)
+            key_rotation = cos[:, None], sin[:, None]  # (V, 1, S, c / 2), for all layers
             if not config.turn_to_cam_coord:  # in the camera frame the rays sit at 0: no turn
-                cos, sin = self.transformer.rope_emb(origins, head_dim)
-                ray_rotation = cos.flatten(0, 1)[:, None], sin.flatten(0, 1)[:, None]  # (B V, 1, 1, c / 2)
-            tokens = tokens[:, None]  # (B, 1, S, d): projected once for all views
+                cos, sin = self.transformer.rope_emb(origins, self.transformer.head_dim)
+                ray_rotation = cos[:, None], sin[:, None]  # (B V, 1, 1, c / 2)
         else:
-            x = x + self._encode_position(origins).flatten(0, 1)
-            tokens = tokens[:, None] + self._encode_position(points)  # (B, V, S, d)
+            x = x + self._encode_position(origins)
+        windows: list[Windows | None] = [None, None]
+        if config.view_transformer_use_swin_attn:
+            windows = [Windows(h, w, shifted, x.device) for shifted in (False, True)]
 
+        # (1, S, d): projected once for all views; where positions are added to them, (V, S, d)
+        source: Sequence[Any] = [self._sources(tokens, points)] * len(self.transformer.layers)
+        if keys_values is not None:
+            source = keys_values
         outputs = []
         for i, layer in enumerate(self.transformer.layers):
-            keys, values = layer.multihead_attn.keys_values(layer.kv_norm(tokens))
-            keys = rotate(keys, key_rotation).expand(-1, views, -1, -1, -1).flatten(0, 1)
-            values = values.expand(-1, views, -1, -1, -1).flatten(0, 1)
-            windows = Windows(h, w, i % 2 == 1, x.device) if config.view_transformer_use_swin_attn else None
-            x = layer(x, keys, values, ray_rotation, mask, windows)
+            x = run_layer(layer, x, source[i], key_rotation, ray_rotation, tokens.segments, windows[i % 2])
             outputs.append(x)
 
         if config.use_dpt_decoder:
             image = self.out_dpt([outputs[i] for i in config.dpt_layers], h, w)
         else:
             image = from_patches(self.out_proj(x), h, w, config.patch_size)
+        image = image.float()
         activated = F.elu(image, alpha=1e-3)
         if self.training and self.gradient_leak:  # same value, more gradient where the output is negative
             activated = activated + self.gradient_leak * (image - image.detach()) * (image < 0)
-        image = activated
-        return image.permute(0, 2, 3, 1).unflatten(0, (batch, views))
+        return activated.permute(0, 2, 3, 1).unflatten(0, (batch, views)).contiguous()
+
+    def camera_points(self, tokens: Tokens, camera_to_world: Tensor) -> Tensor:
+        """(V, S, 9): the tokens' positions as the view stage sees them, in each of their scene's V cameras or in the world."""
+        if not self.config.turn_to_cam_coord:
+            return tokens.positions.expand(camera_to_world.shape[1], -1, -1)
+        camera = camera_to_world.float()[tokens.segments.index(camera_to_world.device)].transpose(0, 1)  # (V, S, 4, 4)
+        relative = tokens.positions.unflatten(-1, (3, 3)) - camera[:, :, None, :3, 3]  # (V, S, 3 vertices, 3)
+        # World to camera: p_c = R^T (p - o), as row vectors (p - o) R.
+        return (relative[..., :, None] * camera[:, :, None, :3, :3]).sum(dim=-2).flatten(-2)
+
+    def _sources(self, tokens: Tokens, points: Tensor) -> Tensor:
+        """What the rays attend to: (1, S, d), or (V, S, d) where the encoding is added to the tokens."""
+        if self.config.pe_type == "rope":
+            return tokens.x[None]
+        return tokens.x[None] + self._encode_position(points)
+
+    def project(self, tokens: Tokens) -> list[KeysValues] | None:
+        """Keys and values of every layer, to decode more views later; None where they differ from view to view."""
+        if self.config.pe_type != "rope":
+            return None
+        return [layer.keys_values(tokens.x[None]) for layer in self.transformer.layers]
 
 
 class RenderFormer(nn.Module):
@@ -252,82 +248,126 @@ class RenderFormer(nn.Module):
         if config.num_register_tokens:
             self.reg_tokens = nn.Parameter(torch.randn(1, config.num_register_tokens, dim) * 0.02)
         self.texture_encoder = nn.Linear(config.texture_channels * config.texture_encode_patch_size**2, dim)
-        self.texture_encoder_norm = nn.RMSNorm(dim, EMBEDDING_EPS)
+        self.texture_encoder_norm = RMSNorm(dim, EMBEDDING_EPS)
         self.vn_encoding_proj = nn.Linear(9 * (1 + 2 * config.vn_pe_num_freqs), dim)
-        self.vn_encoder_norm = nn.RMSNorm(dim, EMBEDDING_EPS)
+        self.vn_encoder_norm = RMSNorm(dim, EMBEDDING_EPS)
         if config.pe_type == "nerf":
             self.tri_encoding_proj = nn.Linear(9 * (1 + 2 * config.vertex_pe_num_freqs), dim)
-            self.tri_encoding_norm = nn.RMSNorm(dim, EMBEDDING_EPS)
+            self.tri_encoding_norm = RMSNorm(dim, EMBEDDING_EPS)
         self.transformer = Encoder(config)
         self.view_transformer = ViewTransformer(config)
 
-    def _encode_material(self, material: Tensor) -> Tensor:
-        """(B, N, C) or (B, N, C, P, P) -> (B, N, d)."""
+    def read(self, batch: Mapping[str, Any], device: torch.device | str = "cpu") -> Triangles:
+        """This network's input from padded numpy arrays (``model.inputs.scenes_of``)."""
+        return scenes_of(batch, self.config.texture_channels, self.config.texture_encode_patch_size, device)
+
+    def _encode_material(self, scenes: Triangles) -> Tensor:
+        """(T, d)."""
         channels, patch = self.config.texture_channels, self.config.texture_encode_patch_size
-        if material.shape[2] != channels or (material.ndim == 5 and material.shape[3:] != (patch, patch)):
+        patches = scenes.patches
+        if scenes.material.shape[1] != channels or (patches is not None and patches.shape[1:] != (channels, patch, patch)):
+            found = [tuple(x.shape) for x in (scenes.material, patches) if x is not None]
             raise ValueError(
-                f"material has shape {tuple(material.shape)}: the model reads {channels} channels, "
+                f"material has shape {', '.join(map(str, found))}: the model reads {channels} channels, "
                 f"as one vector or a {patch} x {patch} patch per triangle"
             )
         encoder = self.texture_encoder
-        material = encode_emission(material, dim=2)
-        if material.ndim == 5:
-            return encoder(material.flatten(2))
         # A constant patch is an outer product with the kept cells: sum their weights first, exactly the same result.
         weight = encoder.weight.view(-1, channels, patch * patch)
-        return F.linear(material, weight @ kept_cells(patch, weight.device).flatten().to(weight.dtype), encoder.bias)
+        weight = weight @ kept_cells(patch, weight.device).flatten().to(weight.dtype)
+        x = F.linear(encode_emission(scenes.material), weight, encoder.bias)
+        if patches is not None:
+            full = encoder(encode_emission(patches).flatten(1))
+            x = x.index_copy(0, scenes.textured, full.to(x.dtype))
+        return x
 
-    def _positions(self, scene: Triangles) -> Tensor:
-        """(B, S, 9): the mean of all valid vertices, three times, for every register; then the triangles' vertices."""
-        triangles = scene.triangles
-        if scene.mask is None:
-            mean = triangles.mean(dim=(1, 2))
-        else:
-            weight = scene.mask[:, :, None, None].to(triangles.dtype)
-            mean = (triangles * weight).sum(dim=(1, 2)) / (3 * weight.sum(dim=(1, 2)).clamp(min=1))
-        registers = mean.repeat(1, 3)[:, None].expand(-1, self.config.num_register_tokens, -1)
-        return torch.cat([registers, triangles.flatten(2)], dim=1)
-
-    def _key_mask(self, scene: Triangles) -> Tensor | None:
-        """(B, 1, 1, S) bool; registers always count."""
-        if scene.mask is None:
-            return None
-        return F.pad(scene.mask, (self.config.num_register_tokens, 0), value=True)[:, None, None]
-
-    def encode(self, scene: Triangles) -> Tensor:
-        """View-independent stage: (B, S, d) tokens that carry the scene's light, S = registers + triangles."""
+    def encode(self, scenes: Triangles) -> Tokens:
+        """View-independent stage: tokens that carry the scenes' light."""
         config = self.config
-        x = self.tri_token + self.texture_encoder_norm(self._encode_material(scene.material))
-        normals = sinusoids(scene.vertex_normals.flatten(2), config.vn_pe_num_freqs)
+        x = self.tri_token[0] + self.texture_encoder_norm(self._encode_material(scenes))
+        normals = sinusoids(scenes.vertex_normals.flatten(1), config.vn_pe_num_freqs)
         x = x + self.vn_encoder_norm(self.vn_encoding_proj(normals))
         if config.pe_type == "nerf":
-            vertices = sinusoids(scene.triangles.flatten(2), config.vertex_pe_num_freqs)
+            vertices = sinusoids(scenes.triangles.flatten(1), config.vertex_pe_num_freqs)
             x = x + self.tri_encoding_norm(self.tri_encoding_proj(vertices))
-        if config.num_register_tokens:
-            x = torch.cat([self.reg_tokens.to(x.dtype).expand(x.shape[0], -1, -1), x], dim=1)
-        return self.transformer(x, self._positions(scene), self._key_mask(scene))
+        positions, segments, registers = scenes.triangles.flatten(1), scenes.segments, config.num_register_tokens
+        if registers:  # in front of the triangles of each scene
+            rows, places = [], []
+            for own, where in zip(segments.split(x, 0), segments.split(positions, 0), strict=True):
+                mean = where.unflatten(1, (3, 3)).mean(dim=(0, 1)).repeat(3)
+                rows += [self.reg_tokens[0].to(x.dtype), own]
+                places += [mean.expand(registers, -1), where]
+            x, positions = torch.cat(rows), torch.cat(places)
+            segments = Segments([registers + n for n in segments.lengths])
+        return Tokens(self.transformer(x, positions, segments), positions, segments)
 
     def decode(
-        self, tokens: Tensor, scene: Triangles, camera_to_world: Tensor, fov_deg: Tensor, resolution: int | tuple[int, int]
-    ) -> Tensor:
+        self, tokens: Tokens, camera_to_world: Tensor, fov_deg: Tensor, resolution: int | tuple[int, int],
+        keys_values: Sequence[KeysValues] | None = None,
+    ) -> Tensor:  # fmt: skip
         """View-dependent stage: cameras (B, V, 4, 4) and (B, V) degrees -> (B, V, H, W, 3), log10(1 + radiance)."""
         height, width = (resolution, resolution) if isinstance(resolution, int) else resolution
         multiple = self.config.resolution_multiple
         if min(height, width) < multiple or height % multiple or width % multiple:
             raise ValueError(f"resolution {height}x{width} must be a multiple of {multiple} pixels for this model")
-        return self.view_transformer(
-            tokens, self._positions(scene), self._key_mask(scene), camera_to_world, fov_deg, height, width
-        )
+        return self.view_transformer(tokens, camera_to_world, fov_deg, height, width, keys_values)
 
     def forward(
-        self, scene: Triangles, camera_to_world: Tensor, fov_deg: Tensor, resolution: int | tuple[int, int],
-        mixed_precision: bool = False,
+        self, scenes: Triangles, camera_to_world: Tensor, fov_deg: Tensor, resolution: int | tuple[int, int],
+        precision: str = "fp32",
     ) -> Tensor:  # fmt: skip
-        """Both stages. ``mixed_precision`` runs the view-independent one in bfloat16, as the paper does."""
-        device = scene.triangles.device.type
-        with torch.autocast(device, dtype=torch.bfloat16) if mixed_precision else nullcontext():
-            tokens = self.encode(scene)
-        return self.decode(tokens.float(), scene, camera_to_world, fov_deg, resolution)
+        """Both stages. ``precision``: fp32; mixed, the view-independent one in bfloat16 as in the paper; bf16, both."""
+        device = scenes.triangles.device.type
+        with autocast(device, precision in ("mixed", "bf16")):
+            tokens = self.encode(scenes)
+        with autocast(device, precision == "bf16"):
+            if precision == "mixed":
+                tokens.x = tokens.x.float()
+            return self.decode(tokens, camera_to_world, fov_deg, resolution)
+
+    @torch.inference_mode()
+    def render(
+        self, scenes: Triangles, camera_to_world: Tensor, fov_deg: Tensor, resolution: int | tuple[int, int],
+        precision: str = "fp32", rays_at_once: int | None = None,
+    ) -> Tensor:  # fmt: skip
+        """As ``forward``, for any number of views: scenes are encoded, and keys and values projected, once for all of them.
+
+        ``rays_at_once`` ray bundles are decoded together; None: a CPU's caches like few, a GPU's processors many.
+        """
+        device = scenes.triangles.device.type
+        height, width = (resolution, resolution) if isinstance(resolution, int) else resolution
+        most = rays_at_once or (1024 if device == "cpu" else 16384)
+        views = max(1, most // max(1, len(scenes.segments) * height * width // self.config.patch_size**2))
+        with autocast(device, precision in ("mixed", "bf16")):
+            tokens = self.encode(scenes)
+        with autocast(device, precision == "bf16"):
+            if precision == "mixed":
+                tokens.x = tokens.x.float()
+            projected = self.view_transformer.project(tokens)
+            images = [
+                self.decode(tokens, cameras, fov, resolution, projected)
+                for cameras, fov in zip(camera_to_world.split(views, 1), fov_deg.split(views, 1), strict=True)
+            ]
+        return torch.cat(images, dim=1)
+
+    def layers(self) -> list[nn.Module]:
+        """Every transformer layer of both stages: the units of compilation, recomputation and sharding."""
+        return [*self.transformer.layers, *self.view_transformer.transformer.layers]
+
+    def compile_layers(self, backend: str = "inductor") -> None:
+        """``torch.compile`` for the layers, in place: a few small graphs for all of them, whatever the number of triangles."""
+        for layer in self.layers():
+            layer.compile(backend=backend)
+
+    def activation_checkpointing(self, on: bool = True) -> None:
+        """Keep only the layers' inputs for the backward pass and compute the rest again: same result, less memory."""
+        for layer in self.layers():
+            layer.recompute = on
+
+
+def autocast(device: str, on: bool) -> AbstractContextManager:
+    """bfloat16 for matrix products where ``on``."""
+    return torch.autocast(device, dtype=torch.bfloat16) if on else nullcontext()
 
 
 def to_radiance(y: Tensor) -> Tensor:

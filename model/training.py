@@ -1,8 +1,9 @@
 """The training loop (section 3.3): resumable, and after a kill exactly the run that it would have been.
 
-Reads batches that are a pure function of the step; writes ``training.pt`` (what is needed to go on) and ``log.jsonl`` into the
-folder it is given. The one design choice: everything that changes from step to step is in ``training.pt``, replaced
-atomically, and the log is cut back to that step on resume, so nothing is logged twice.
+Reads batches that are a pure function of the step; writes into the folder it is given ``training.pt`` (what is needed to go
+on), ``log.jsonl``, and in the released format ``last/`` (at the end) and ``best/`` (lowest validation error so far). The one
+design choice: everything that changes from step to step is in ``training.pt``, replaced atomically, and the log is cut back to
+that step on resume, so nothing is logged twice. Many processes (``model.parallel``) follow the run of one.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,14 +22,20 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from model import checkpoint
 from model.checkpoint import replace
+from model.flops import TRAINING, forward_flops, ideal_seconds, peak_flops
+from model.logs import TrainingLog
 from model.losses import LPIPS, image_loss, log_radiance
-from model.renderformer import RenderFormer, Triangles, constant_material, to_radiance
+from model.optimization import Average, optimizers, schedule, set_learning_rate
+from model.parallel import Group, accumulating, distribute, gather, scatter
+from model.renderformer import RenderFormer, to_radiance
 
-STATE, LOG = "training.pt", "log.jsonl"
+STATE, LAST, BEST = "training.pt", "last", "best"
 PATIENCE = 20  # this many non-finite steps in a row stop the run
 
 Batch = Mapping[str, Any]
+Pair = tuple[np.ndarray, np.ndarray]  # a reference and a prediction, each (H, W, 3) radiance
 
 
 @dataclass(frozen=True)
@@ -43,92 +51,115 @@ class FitConfig:
     clip: float = 1.0  # largest gradient norm
     optimizer: str = "adamw"  # adamw | muon (2-D hidden weights; AdamW for the rest)
     muon_lr: float = 0.02  # highest learning rate of Muon's weights: the size of a step in spectral norm
+    ema: float = 0.0  # decay of the averaged weights, which are then the ones validated and saved; 0: none
     lpips: float = 0.0  # weight of LPIPS(VGG)
     gradient_leak: float = 0.0  # gradient, beyond ELU's own, of pixels that come out negative: without it they can die
-    # Runtime: these do not change the result
+    # Runtime: these do not change the result, or only its rounding
     lpips_folder: Path | None = None
-    mixed_precision: bool = False  # bfloat16 view-independent stage, and TF32 in the other
+    precision: str = "fp32"  # fp32 | mixed (view-independent stage in bfloat16, TF32 in the other) | bf16
+    micro_scenes: int | None = None  # scenes of a process in memory at once; gradients of the parts add up. None: all
+    activation_checkpointing: bool = False
+    sharded: bool = False  # FSDP instead of DDP, where there are several processes
     compile: bool = False
     log_every: int = 50
     validate_every: int = 1000
     checkpoint_every: int = 500
+    pictures: int = 6  # validation scenes shown
 
-    RUNTIME = ("lpips_folder", "mixed_precision", "compile", "log_every", "validate_every", "checkpoint_every")
+    RUNTIME = (
+        "lpips_folder", "precision", "micro_scenes", "activation_checkpointing", "sharded", "compile", "log_every",
+        "validate_every", "checkpoint_every", "pictures",
+    )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
         return {name: value for name, value in dataclasses.asdict(self).items() if name not in self.RUNTIME}
 
 
-def schedule(config: FitConfig, step: int) -> float:
-    """Share of the highest learning rate at the 0-based step: linear warm-up, then cosine."""
-    if step < config.warmup:
-        return (step + 1) / config.warmup
-    end = config.steps if config.decay_steps is None else config.decay_steps
-    progress = min(1.0, (step - config.warmup) / max(1, end - config.warmup))
-    return config.final_lr + (1 - config.final_lr) * 0.5 * (1 + math.cos(math.pi * progress))
-
-
-def optimizers(model: nn.Module, config: FitConfig) -> list[torch.optim.Optimizer]:
-    """AdamW for all, or Muon for the transformer layers' matrices and AdamW for the rest."""
-    named = [(name, p) for name, p in model.named_parameters() if p.requires_grad]
-    hidden = {name for name, p in named if p.ndim == 2 and ".layers." in name}
-    if config.optimizer == "adamw":
-        hidden = set()
-    elif config.optimizer != "muon":
-        raise ValueError(f"optimizer={config.optimizer!r} is unknown: adamw or muon")
-    rest = [(name, p) for name, p in named if name not in hidden]
-    decayed = [p for name, p in rest if p.ndim >= 2 and "token" not in name]
-    plain = [p for name, p in rest if not (p.ndim >= 2 and "token" not in name)]
-    groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": plain, "weight_decay": 0.0}]
-    found: list[torch.optim.Optimizer] = [
-        torch.optim.AdamW([g for g in groups if g["params"]], lr=config.lr, betas=(0.9, 0.95))
-    ]
-    if hidden:
-        matrices = [p for name, p in named if name in hidden]
-        found.append(torch.optim.Muon(matrices, lr=config.muon_lr, weight_decay=config.weight_decay))
-    return found
-
-
-def scene_of(batch: Batch, model: RenderFormer, device: torch.device | str) -> Triangles:
-    """The network's input from a batch of numpy arrays (see ``Triangles``); emission stays radiance here."""
-    arrays = {
-        name: torch.from_numpy(np.ascontiguousarray(batch[name])).to(device, non_blocking=True)
-        for name in ("triangles", "vertex_normals", "diffuse", "specular", "roughness", "emission")
-    }
-    material = constant_material(
-        arrays["diffuse"], arrays["specular"], arrays["roughness"], arrays["emission"], model.config.texture_channels
-    )
-    mask = None if batch["mask"].all() else torch.from_numpy(batch["mask"]).to(device, non_blocking=True)
-    return Triangles(arrays["triangles"], arrays["vertex_normals"], material, mask)
-
-
-def predict(forward: Callable[..., Tensor], model: RenderFormer, batch: Batch, device: Any, mixed: bool) -> Tensor:
+def predict(forward: Callable[..., Tensor], model: RenderFormer, batch: Batch, device: Any, precision: str) -> Tensor:
     """(B, V, H, W, 3) log10(1 + radiance) for the batch's cameras, at its images' size."""
     cameras = torch.from_numpy(np.ascontiguousarray(batch["camera_to_world"])).to(device, non_blocking=True)
     fov = torch.from_numpy(np.ascontiguousarray(batch["fov_deg"])).to(device, non_blocking=True)
-    return forward(scene_of(batch, model, device), cameras, fov, tuple(batch["image"].shape[2:4]), mixed)
+    return forward(model.read(batch, device), cameras, fov, tuple(batch["image"].shape[2:4]), precision)
 
 
-def evaluate(model: RenderFormer, batches: Sequence[Batch], device: Any, mixed: bool = False) -> dict[str, float]:
-    """Means over all views: ``log_error`` (L1 of log10(1 + x)) and ``psnr`` of linear radiance clamped to [0, 1], in dB."""
-    errors, psnrs = [], []
+def evaluate(
+    model: RenderFormer, batches: Sequence[Batch], group: Group, precision: str = "fp32", pictures: int = 0
+) -> tuple[dict[str, float], list[Pair]]:
+    """Means over all views: ``log_error`` (L1 of log10(1 + x)) and ``psnr`` of linear radiance clamped to [0, 1], in dB.
+
+    Each process measures its share of the batches. Also the first views of the first ``pictures`` batches (of its share).
+    """
+    sums = torch.zeros(3, dtype=torch.float64)
+    pairs: list[Pair] = []
     model.eval()
-    with torch.inference_mode():
-        for batch in batches:
-            y = predict(model, model, batch, device, mixed).float()
-            image = torch.from_numpy(batch["image"]).to(device)
-            errors.append((y - log_radiance(image)).abs().mean(dim=(2, 3, 4)).flatten())
+    with torch.no_grad():
+        for number, batch in _share(batches, group):
+            y = predict(model, model, batch, group.device, precision).float()
+            image = torch.from_numpy(np.ascontiguousarray(batch["image"])).to(group.device)
+            errors = (y - log_radiance(image)).abs().mean(dim=(2, 3, 4)).flatten()
             mse = (to_radiance(y).clamp(0, 1) - image.clamp(0, 1)).square().mean(dim=(2, 3, 4)).flatten()
-            psnrs.append(-10 * torch.log10(mse.clamp(min=1e-10)))
+            psnrs = -10 * torch.log10(mse.clamp(min=1e-10))
+            if number is not None:
+                sums += torch.stack([errors.sum(), psnrs.sum(), torch.tensor(float(len(errors)))]).double().cpu()
+                if number < pictures:
+                    pairs.append((batch["image"][0, 0], to_radiance(y[0, 0]).cpu().numpy()))
     model.train()
-    return {"log_error": torch.cat(errors).mean().item(), "psnr": torch.cat(psnrs).mean().item()}
+    error, psnr, count = group.mean(sums.to(group.device)).tolist()
+    return {"log_error": error / count, "psnr": psnr / count}, pairs
 
 
-def _tokens(batch: Batch, model: RenderFormer) -> int:
-    """Triangle, register and ray tokens of a batch, padding not counted."""
-    views, height, width = batch["image"].shape[1:4]
-    rays = views * (height // model.config.patch_size) * (width // model.config.patch_size)
-    return int(batch["mask"].sum()) + batch["mask"].shape[0] * (model.config.num_register_tokens + rays)
+def _share(batches: Sequence[Batch], group: Group) -> Iterator[tuple[int | None, Batch]]:
+    """(number, batch) of this process; all take part equally often (FSDP), with number None where one stands in."""
+    for first in range(0, len(batches), group.world):
+        number = first + group.rank
+        yield (number, batches[number]) if number < len(batches) else (None, batches[first])
+
+
+def parts(batch: Batch, most: int | None) -> Iterator[tuple[Batch, float, bool]]:
+    """The batch in parts of at most ``most`` scenes, each with its share of the scenes and whether it is the last."""
+    scenes = len(batch["mask"])
+    most = most or scenes
+    for first in range(0, scenes, most):
+        last = min(first + most, scenes)
+        # Textures are shared by the batch's scenes, which refer to them by row.
+        part = {name: value if name == "patches" else value[first:last] for name, value in batch.items()}
+        yield part, (last - first) / scenes, last == scenes
+
+
+class Work:
+    """Scenes, tokens and floating-point operations since the last log line, for rates and utilisation."""
+
+    def __init__(self, model: RenderFormer, group: Group, precision: str):
+        self.model, self.group, self.precision = model, group, precision
+        self.peaks = {"float32": peak_flops(str(group.device), "float32")}
+        if precision != "fp32":
+            self.peaks["bfloat16"] = peak_flops(str(group.device), "bfloat16")
+        self.start()
+
+    def start(self) -> None:
+        self.began, self.scenes, self.tokens, self.ideal = time.perf_counter(), 0, 0, 0.0
+
+    def add(self, batch: Batch) -> None:
+        """One training step; padding is not counted."""
+        config = self.model.config
+        triangles = batch["mask"].sum(axis=1).tolist()
+        views, height, width = batch["image"].shape[1:4]
+        rays = views * (height // config.patch_size) * (width // config.patch_size)
+        textured = int((batch["patch_index"] >= 0).sum()) if "patch_index" in batch else 0
+        self.scenes += len(triangles)
+        self.tokens += sum(triangles) + len(triangles) * (config.num_register_tokens + rays)
+        flops = forward_flops(config, triangles, views, height, width, textured)
+        self.ideal += TRAINING * ideal_seconds(flops, self.peaks, self.precision)
+
+    def rates(self) -> dict[str, float]:
+        """Over all processes, which do equal work; ``mfu``: time at the rate of a large matrix product, over elapsed time."""
+        elapsed = time.perf_counter() - self.began
+        return {
+            "scenes_per_s": round(self.group.world * self.scenes / elapsed, 3),
+            "tokens_per_s": round(self.group.world * self.tokens / elapsed, 1),
+            "memory_gb": round(_memory_gb(self.group.device), 3),
+            "mfu": round(self.ideal / elapsed, 4),
+        }
 
 
 def _memory_gb(device: torch.device) -> float:
@@ -141,34 +172,36 @@ def _memory_gb(device: torch.device) -> float:
 
 
 class _State:
-    """All that changes from step to step, as one file."""
+    """All that changes from step to step, as one file: whole tensors, however many processes there are."""
 
-    def __init__(self, model: RenderFormer, config: FitConfig, folder: Path):
-        self.model, self.config, self.path = model, config, folder / STATE
-        self.optimizers = optimizers(model, config)
-        self.step = 0  # steps done
+    PLAIN = ("step", "skipped", "skipped_in_a_row", "seconds", "window", "best")
+
+    def __init__(self, model: RenderFormer, config: FitConfig, folder: Path, group: Group):
+        self.model, self.config, self.path, self.group = model, config, folder / STATE, group
+        self.optimizers = optimizers(model, config.optimizer, config.lr, config.muon_lr, config.weight_decay)
+        self.average = Average(model, config.ema) if config.ema else None
+        self.step = 0  # steps done: also the position in the data
         self.skipped = 0
         self.skipped_in_a_row = 0
         self.seconds = 0.0
         self.window: list[list[float]] = []  # loss, gradient norm of the steps since the last log line
+        self.best: float | None = None  # lowest validation log error so far
 
     def save(self) -> None:
-        temporary = self.path.with_suffix(".tmp")
-        plain = {name: getattr(self, name) for name in ("step", "skipped", "skipped_in_a_row", "seconds", "window")}
-        rng = {"cpu": torch.get_rng_state()}
+        whole = {
+            "identity": self._identity(),
+            "plain": {name: getattr(self, name) for name in self.PLAIN},
+            "model": gather(self.model.state_dict()),
+            "optimizers": [gather(optimizer.state_dict()) for optimizer in self.optimizers],
+            "average": gather(self.average.values) if self.average else None,
+            "rng": {"cpu": torch.get_rng_state()},
+        }
         if torch.cuda.is_available():
-            rng["cuda"] = torch.cuda.get_rng_state()
-        torch.save(
-            {
-                "identity": self._identity(),
-                "plain": plain,
-                "model": self.model.state_dict(),
-                "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
-                "rng": rng,
-            },
-            temporary,
-        )
-        replace(temporary, self.path)
+            whole["rng"]["cuda"] = torch.cuda.get_rng_state()
+        if self.group.leads:
+            temporary = self.path.with_suffix(".tmp")
+            torch.save(whole, temporary)
+            replace(temporary, self.path)
 
     def load(self) -> bool:
         """Whether there was something to go on from."""
@@ -177,9 +210,18 @@ class _State:
         saved = torch.load(self.path, map_location="cpu", weights_only=True)
         if saved["identity"] != self._identity():
             raise ValueError(f"{self.path} belongs to a training run of another configuration: give it another folder")
-        self.model.load_state_dict(saved["model"])
+        own = self.model.state_dict()
+        self.model.load_state_dict({name: scatter(value, own[name]) for name, value in saved["model"].items()})
         for optimizer, state in zip(self.optimizers, saved["optimizers"], strict=True):
+            parameters = [p for group in optimizer.param_groups for p in group["params"]]
+            for index, values in state["state"].items():
+                for name, value in values.items():
+                    if isinstance(value, Tensor):
+                        values[name] = scatter(value, parameters[index])
             optimizer.load_state_dict(state)
+        if self.average is not None:
+            for name, value in saved["average"].items():
+                self.average.values[name].copy_(scatter(value, self.average.values[name]))
         torch.set_rng_state(saved["rng"]["cpu"])
         if "cuda" in saved["rng"] and torch.cuda.is_available():
             torch.cuda.set_rng_state(saved["rng"]["cuda"])
@@ -187,23 +229,19 @@ class _State:
             setattr(self, name, value)
         return True
 
+    def averaged(self) -> Any:
+        """A context in which the model has the weights that count: the averaged ones, if there are any."""
+        return self.average.in_place() if self.average else nullcontext()
+
+    def release(self, folder: Path, trained_with: Mapping[str, str] | None) -> None:
+        """Save the weights that count as a released-format checkpoint."""
+        with self.averaged():
+            weights = gather(self.model.state_dict())
+            if self.group.leads:
+                checkpoint.save(self.model.config, weights, folder, trained_with)
+
     def _identity(self) -> str:
         return json.dumps([self.model.config.to_dict(), self.config.identity()], sort_keys=True)
-
-
-def _cut_log(path: Path, step: int) -> None:
-    """Drop lines after ``step``, and a last one that a kill cut short."""
-    kept = []
-    for line in path.read_text().splitlines() if path.is_file() else []:
-        try:
-            row = json.loads(line)
-        except ValueError:
-            break
-        if row["step"] <= step:
-            kept.append(line + "\n")
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text("".join(kept))
-    replace(temporary, path)
 
 
 def fit(
@@ -212,98 +250,110 @@ def fit(
     batches: Callable[[int, int], Iterable[Batch]],
     validation: Sequence[Batch],
     folder: Path,
-    device: torch.device | str,
-    log: Callable[[str], None] = print,
+    group: Group,
+    say: Callable[[str], None] = print,
+    show: Callable[[int, list[Pair]], np.ndarray] | None = None,
+    tensorboard: Path | None = None,
+    trained_with: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Train ``model`` in place up to ``config.steps``, going on from ``folder`` if it holds a state.
 
-    ``batches(start, stop)`` yields the batches of those steps, each a pure function of its step: dicts of float32 arrays
-    triangles (B, N, 3, 3), vertex_normals, diffuse, specular, roughness, emission (radiance), mask (B, N) bool,
-    camera_to_world (B, V, 4, 4), fov_deg (B, V), image (B, V, H, W, 3) radiance. ``validation`` is a fixed list of such.
-    Returns steps, skipped, seconds and the last validation's metrics.
+    ``batches(start, stop)`` yields the batches of those steps, each a pure function of its step and this process's slice of the
+    global batch: dicts of numpy arrays as ``model.inputs.scenes_of`` reads them, with camera_to_world (B, V, 4, 4), fov_deg
+    (B, V) and image (B, V, H, W, 3) radiance. ``validation`` is a fixed list of such; ``show`` makes a picture of some views.
+    ``trained_with`` goes into the checkpoints. Returns steps, skipped, seconds, and the last and best validation's metrics.
     """
-    device = torch.device(device)
+    if config.precision not in ("fp32", "mixed", "bf16"):
+        raise ValueError(f"precision={config.precision!r} is unknown: fp32, mixed or bf16")
     folder.mkdir(parents=True, exist_ok=True)
-    model.to(device).train()
+    model.to(group.device).train()
     model.view_transformer.gradient_leak = config.gradient_leak
-    if config.mixed_precision:
+    model.activation_checkpointing(config.activation_checkpointing)
+    if config.precision != "fp32" and group.device.type == "cuda":
         torch.set_float32_matmul_precision("high")
-    lpips = LPIPS.load(config.lpips_folder).to(device) if config.lpips > 0 else None
-    state = _State(model, config, folder)
-    if state.load():
-        log(f"going on from step {state.step:,} of {config.steps:,}")
-    _cut_log(folder / LOG, state.step)
-    forward = torch.compile(model) if config.compile else model
-    parameters = [p for optimizer in state.optimizers for group in optimizer.param_groups for p in group["params"]]
+    if config.compile:
+        model.compile_layers()
+    lpips = LPIPS.load(config.lpips_folder).to(group.device) if config.lpips > 0 else None
+    forward = distribute(model, group, config.sharded)
+    state = _State(model, config, folder, group)
+    if state.load() and group.leads:
+        say(f"going on from step {state.step:,} of {config.steps:,}")
+    parameters = [p for optimizer in state.optimizers for one in optimizer.param_groups for p in one["params"]]
+    work = Work(model, group, config.precision)
+    # Only the first process writes. All have read the state by now, and none goes on before the log is cut.
+    log = TrainingLog(*((folder, tensorboard) if group.leads else (None, None)), state.step, config.steps,
+                      say if group.leads else lambda text: None)  # fmt: skip
+    group.wait()
     metrics: dict[str, float] = {}
 
-    with (folder / LOG).open("a") as file:
+    def validate() -> dict[str, float]:
+        with state.averaged():
+            found, pairs = evaluate(model, validation, group, config.precision, config.pictures if show else 0)
+        if state.best is None or found["log_error"] < state.best:
+            state.best = found["log_error"]
+            state.release(folder / BEST, trained_with)
+        if pairs and group.leads:
+            log.picture("validation/reference above, prediction below", show(state.step, pairs), state.step)
+        return found
 
-        def write(row: dict[str, Any]) -> None:
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-
-        began, base_seconds = time.perf_counter(), state.seconds
-        interval_began, interval_scenes, interval_tokens = began, 0, 0
-        for step, batch in enumerate(batches(state.step, config.steps), start=state.step):
-            share = schedule(config, step)
+    base_seconds, began = state.seconds, time.perf_counter()
+    work.start()
+    for step, batch in enumerate(batches(state.step, config.steps), start=state.step):
+        share = schedule(step, config.steps, config.warmup, config.decay_steps, config.final_lr)
+        set_learning_rate(state.optimizers, share)
+        loss = torch.zeros((), device=group.device)
+        for part, weight, last in parts(batch, config.micro_scenes):
+            with accumulating(forward, last):
+                y = predict(forward, model, part, group.device, config.precision)
+                image = torch.from_numpy(np.ascontiguousarray(part["image"])).to(group.device, non_blocking=True)
+                part_loss = weight * image_loss(y, image, lpips, config.lpips)
+                part_loss.backward()
+                loss += part_loss.detach()
+        norm = gather(nn.utils.clip_grad_norm_(parameters, config.clip))
+        loss_value, norm_value = torch.stack([group.mean(loss), norm]).tolist()
+        if math.isfinite(loss_value) and math.isfinite(norm_value):
             for optimizer in state.optimizers:
-                for group in optimizer.param_groups:
-                    group["lr"] = share * (config.muon_lr if isinstance(optimizer, torch.optim.Muon) else config.lr)
-            y = predict(forward, model, batch, device, config.mixed_precision)
-            loss = image_loss(y, torch.from_numpy(batch["image"]).to(device), lpips, config.lpips)
-            loss.backward()
-            norm = nn.utils.clip_grad_norm_(parameters, config.clip)
-            loss_value, norm_value = loss.item(), norm.item()
-            if math.isfinite(loss_value) and math.isfinite(norm_value):
-                for optimizer in state.optimizers:
-                    optimizer.step()
-                state.window.append([loss_value, norm_value])
-                state.skipped_in_a_row = 0
-            else:
-                state.skipped += 1
-                state.skipped_in_a_row += 1
-                if state.skipped_in_a_row >= PATIENCE:
-                    scenes = ", ".join(str(i) for i in batch.get("ids", ())) or "not named"
-                    raise ValueError(
-                        f"training stopped at step {step}: loss {loss_value}, gradient norm {norm_value}, not finite for "
-                        f"{PATIENCE} steps in a row; look at the scenes of this batch ({scenes}), or try a smaller lr"
-                    )
-            for optimizer in state.optimizers:
-                optimizer.zero_grad(set_to_none=True)
-            state.step = step + 1
-            interval_scenes += len(batch["mask"])
-            interval_tokens += _tokens(batch, model)
-            last = state.step == config.steps
+                optimizer.step()
+            if state.average is not None:
+                state.average.update()
+            state.window.append([loss_value, norm_value])
+            state.skipped_in_a_row = 0
+        else:
+            state.skipped += 1
+            state.skipped_in_a_row += 1
+            if state.skipped_in_a_row >= PATIENCE:
+                scenes = ", ".join(str(i) for i in batch.get("ids", ())) or "not named"
+                raise ValueError(
+                    f"training stopped at step {step}: loss {loss_value}, gradient norm {norm_value}, not finite for "
+                    f"{PATIENCE} steps in a row; look at the scenes of this batch ({scenes}), or try a smaller lr"
+                )
+        for optimizer in state.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        state.step = step + 1
+        state.seconds = base_seconds + time.perf_counter() - began
+        work.add(batch)
+        last = state.step == config.steps
 
-            if state.step % config.log_every == 0 or last:
-                now = time.perf_counter()
-                state.seconds, elapsed = base_seconds + now - began, now - interval_began
-                mean_loss, mean_norm = np.mean(state.window, axis=0).tolist() if state.window else (None, None)
-                row = {"step": state.step, "loss": mean_loss, "lr": share * config.lr, "grad_norm": mean_norm}
-                write(row | {"skipped": state.skipped, "seconds": round(state.seconds, 3)})
-                shown = "     nan" if mean_loss is None else f"{mean_loss:8.5f}"
-                log(
-                    f"step {state.step:>{len(str(config.steps))}}/{config.steps}  loss {shown}  lr {share * config.lr:.2e}  "
-                    f"grad {mean_norm or 0:7.3f}  {interval_scenes / elapsed:7.2f} scenes/s  "
-                    f"{interval_tokens / elapsed:9,.0f} tokens/s  {_memory_gb(device):5.2f} GB"
-                    + (f"  {state.skipped} skipped" if state.skipped else "")
-                )
-                state.window = []
-                interval_began, interval_scenes, interval_tokens = now, 0, 0
-            if validation and (state.step % config.validate_every == 0 or last):
-                metrics = evaluate(model, validation, device, config.mixed_precision)
-                write({"step": state.step} | {f"validation_{name}": value for name, value in metrics.items()})
-                log(
-                    f"step {state.step:>{len(str(config.steps))}}/{config.steps}  validation: "
-                    f"log error {metrics['log_error']:.5f}  psnr {metrics['psnr']:.2f} dB"
-                )
-                interval_began = time.perf_counter()
-                interval_scenes = interval_tokens = 0
-            if state.step % config.checkpoint_every == 0 or last:
-                state.seconds = base_seconds + time.perf_counter() - began
-                state.save()
+        if state.step % config.log_every == 0 or last:
+            mean_loss, mean_norm = np.mean(state.window, axis=0).tolist() if state.window else (None, None)
+            log.interval(
+                {"step": state.step, "loss": mean_loss, "lr": share * config.lr, "grad_norm": mean_norm}
+                | {"skipped": state.skipped, "seconds": round(state.seconds, 3)}
+                | work.rates()
+            )
+            state.window = []
+            work.start()
+        if validation and (state.step % config.validate_every == 0 or last):
+            before, metrics = state.best, validate()
+            log.validation(state.step, metrics, state.best != before)
+            work.start()
+        if state.step % config.checkpoint_every == 0 or last:
+            state.save()
     if validation and not metrics:  # killed between the last step and the product: everything was done already
-        metrics = evaluate(model, validation, device, config.mixed_precision)
+        metrics = validate()
+    state.release(folder / LAST, trained_with)
+    log.close()
+    group.wait()
     model.eval()
-    return {"steps": state.step, "skipped": state.skipped, "seconds": round(state.seconds, 1)} | metrics
+    summary = {"steps": state.step, "skipped": state.skipped, "seconds": round(state.seconds, 1)} | metrics
+    return summary | ({"best_log_error": state.best} if state.best is not None else {})

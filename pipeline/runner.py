@@ -143,11 +143,17 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
             raise UserError(f"force={name}: the stage is not among those that stage={','.join(run.stage)} needs")
     artifacts: dict[str, Artifact | None] = {name: store.find(name, planned.key) for name, planned in plan.items()}
     todo = _todo(run, plan, artifacts)
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and run.force:
+        raise UserError(f"force={','.join(run.force)} needs a process of its own: run it without torchrun")
+    if int(os.environ.get("RANK", "0")) > 0 and not run.plan:  # one of several processes that torchrun started
+        return _follow(plan, todo, store)
     for name, planned in plan.items():
         artifact = artifacts[name]
         if name in todo:
             if run.plan:
                 out(f"{_label(system, name)} to make   key {planned.key[:12]}")
+                for line in planned.stage.estimate(planned.config, {other: plan[other].config for other in plan}):
+                    out(f"      {line}")
             else:
                 inputs = {parent: artifacts[parent] for parent in planned.stage.reads(planned.config)}
                 assert all(inputs.values())
@@ -165,6 +171,20 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
         if artifact is not None and headline and not run.plan:
             out(f"{headline}: {artifact.file(headline)}")
     return {"artifacts": artifacts, "keys": {name: planned.key for name, planned in plan.items()}}
+
+
+def _follow(plan: Mapping[str, Planned], todo: set[str], store: Store) -> dict[str, Any]:
+    """What a process does that another one leads: its part of run stages, once what they read has been made."""
+
+    def made(name: str) -> Artifact:
+        while (artifact := store.find(name, plan[name].key)) is None:
+            time.sleep(0.5)
+        return artifact
+
+    for name, planned in plan.items():
+        if name in todo and isinstance(planned.stage, RunStage):
+            planned.stage.follow(planned.config, {parent: made(parent) for parent in planned.stage.inputs})
+    return {"artifacts": {}, "keys": {name: planned.key for name, planned in plan.items()}}
 
 
 def _todo(run: RunConfig, plan: Mapping[str, Planned], artifacts: Mapping[str, Artifact | None]) -> set[str]:

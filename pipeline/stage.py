@@ -83,6 +83,10 @@ class Stage:
         """
         return {}
 
+    def estimate(self, config: StageConfig, configs: Mapping[str, StageConfig]) -> list[str]:
+        """Lines for people, shown by ``plan=true``: what the run will cost. ``configs``: those of all stages of the plan."""
+        return []
+
     def environment(self, config: StageConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
         """Runtime choices that one artifact must not mix (a renderer's backend, say), as plain JSON.
 
@@ -133,6 +137,10 @@ class RunStage(Stage):
         Returns the names, relative to ``draft.files``, of the files that make up the artifact's digest.
         """
         raise NotImplementedError
+
+    def follow(self, config: StageConfig, inputs: Inputs) -> None:
+        """The part of one more process of a ``torchrun``, whose first process is in ``run``; it writes nothing."""
+        raise UserError(f"{self.name} runs in one process: start it without torchrun")
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,12 @@ def command_trace(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def checkpoint_folder(reference: str, store: str) -> Path:
-    """A released-format checkpoint folder as given, or that of a train artifact in the store."""
+def checkpoint_folder(reference: str | None, store: str) -> Path:
+    """A released-format checkpoint folder as given, or that of a train artifact in the store; None: the one that ships."""
+    if reference is None:
+        from stages.predict import shipped_checkpoint
+
+        return shipped_checkpoint()
     if (Path(reference) / "config.json").is_file():
         return Path(reference)
     if Path(reference).is_dir() and not (Path(reference) / "manifest.json").is_file():
@@ -165,7 +169,10 @@ def build_parser() -> argparse.ArgumentParser:
         "predict", command_predict, "render a scene with a trained model", "scene.json --checkpoint train -o out.png"
     )  # fmt: skip
     sub.add_argument("scene", help="scene file: .json or .h5")
-    sub.add_argument("--checkpoint", required=True, help="released-format folder, or a train artifact's key, name or 'train'")
+    sub.add_argument(
+        "--checkpoint",
+        help="released-format folder, or a train artifact's key, name or 'train' (default: the model that ships)",
+    )
     sub.add_argument("-o", "--out", required=True, help="output .exr (linear) or .png (sRGB)")
     sub.add_argument("--resolution", type=int, default=512, help="pixels per side, divisible by 8 (default: 512)")
     sub.add_argument("--view", type=view_argument, default=0, help="camera number, or 'all' (default: 0)")

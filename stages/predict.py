@@ -20,7 +20,19 @@ if TYPE_CHECKING:
     from stages.records import SceneRecord
 
 RELEASED_TRIANGLES = 4096  # most triangles of the released training data, for checkpoints that do not say (section 2)
-RAYS_AT_ONCE = 16384  # ray tokens decoded together
+
+
+PRETRAINED = Path(__file__).resolve().parents[1] / "model" / "pretrained"  # the checkpoint that ships, if one does
+
+
+def shipped_checkpoint() -> Path:
+    """The folder of the model that ships with the project."""
+    if not (PRETRAINED / "config.json").is_file():
+        raise UserError(
+            "no model ships with this version: train one (`make train`) and give --checkpoint train, or give "
+            "--checkpoint FOLDER with a released checkpoint (config.json, model.safetensors)"
+        )
+    return PRETRAINED
 
 
 def load_model(folder: Path) -> RenderFormer:
@@ -37,23 +49,17 @@ def predict_scene(
     import torch
 
     from model.renderformer import to_radiance
-    from model.training import scene_of
 
-    arrays = {name: np.asarray(array)[None] for name, array in scene.arrays().items()}
-    arrays["mask"] = np.ones(arrays["roughness"].shape, bool)
+    arrays = scene.arrays()
+    patches = arrays.pop("patches", None)
+    batch = {name: array[None] for name, array in arrays.items()} | {"mask": np.ones((1, len(scene.triangles)), bool)}
+    if patches is not None:
+        batch["patches"] = patches
     model = model.to(device).eval()
     cameras = torch.from_numpy(scene.camera_to_world[list(views)].astype(np.float32)).to(device)[None]
     fov = torch.from_numpy(scene.fov_deg[list(views)].astype(np.float32)).to(device)[None]
-    rays = (resolution // model.config.patch_size) ** 2
-    step = max(1, RAYS_AT_ONCE // max(1, rays))
-    images = []
-    with torch.inference_mode():
-        triangles = scene_of(arrays, model, device)
-        tokens = model.encode(triangles)
-        for i in range(0, len(views), step):
-            y = model.decode(tokens, triangles, cameras[:, i : i + step], fov[:, i : i + step], resolution)
-            images.append(to_radiance(y[0]).clamp(min=0).cpu())  # the network may undershoot 0 by a thousandth
-    return torch.cat(images).numpy()
+    y = model.render(model.read(batch, device), cameras, fov, resolution)[0]
+    return to_radiance(y).clamp(min=0).cpu().numpy()  # the network may undershoot 0 by a thousandth
 
 
 def predict(

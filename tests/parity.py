@@ -16,9 +16,9 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from model import checkpoint  # noqa: E402
-from model.renderformer import Triangles  # noqa: E402
+from model.inputs import Triangles  # noqa: E402
 
-TOLERANCE = 1e-4
+TOLERANCE = 2e-5
 
 
 def difference(folder: Path) -> float:
@@ -26,10 +26,8 @@ def difference(folder: Path) -> float:
     model, _ = checkpoint.load(folder)
     with np.load(folder / "case.npz", allow_pickle=False) as file:
         case = {name: torch.from_numpy(np.atleast_1d(file[name])) for name in file.files}
-    mask = case["mask"][None]
-    scene = Triangles(case["triangles"][None], case["vn"][None], case["texture"][None], None if mask.all() else mask)
-    with torch.inference_mode():
-        y = model(scene, case["c2w"][None], case["fov"].reshape(1, -1), int(case["resolution"]))[0]
+    scene = Triangles.pack(*(case[name][None] for name in ("triangles", "vn", "texture", "mask")))
+    y = model.render(scene, case["c2w"][None], case["fov"].reshape(1, -1), int(case["resolution"]))[0]
     return float((y - torch.log10(1 + case["hdr"])).abs().max())
 
 

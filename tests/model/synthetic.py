@@ -8,7 +8,13 @@ import numpy as np
 
 
 def batch(
-    step: int, scenes: int = 2, triangles: int = 12, views: int = 2, resolution: int = 16, padded: int = 0
+    step: int,
+    scenes: int = 2,
+    triangles: int = 12,
+    views: int = 2,
+    resolution: int = 16,
+    padded: int = 0,
+    textured: bool = False,
 ) -> dict[str, Any]:
     """A training batch as ``model.training.fit`` reads it; a pure function of its arguments."""
     rng = np.random.default_rng(step)
@@ -28,7 +34,14 @@ def batch(
         mask[0, -padded:] = False
     diffuse = uniform(scenes, triangles, 3)
     level = diffuse.mean(axis=1)[:, None, None, None] * emission[:, 0].mean(axis=-1)[:, None, None, None, None] / 1000
-    return {
+    patches = {}
+    if textured:  # every third triangle but the light
+        index = np.full((scenes, triangles), -1, np.int32)
+        index[:, 2::3] = np.arange(index[:, 2::3].size).reshape(scenes, -1)
+        i = np.arange(32)
+        kept = i[:, None] + i[None, :] <= 32
+        patches = {"patch_index": index, "patches": (uniform(int(index.max()) + 1, 7, 32, 32) * kept).astype(np.float16)}
+    return patches | {
         "triangles": corners,
         "vertex_normals": np.repeat(normals[:, :, None], 3, axis=2).astype(np.float32),
         "diffuse": diffuse,

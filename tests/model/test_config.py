@@ -71,7 +71,7 @@ def test_unsupported_values_are_refused_by_name(fields, named):
 
 def test_checkpoint_round_trip_is_exact(tmp_path):
     model = RenderFormer(ModelConfig(**MICRO))
-    checkpoint.save(model, tmp_path, {"triangles": "700"})
+    checkpoint.save(model.config, model.state_dict(), tmp_path, {"triangles": "700"})
     loaded, trained_with = checkpoint.load(tmp_path)
     assert trained_with == {"triangles": "700"} and loaded.config == model.config
     own, other = model.state_dict(), loaded.state_dict()
@@ -81,7 +81,7 @@ def test_checkpoint_round_trip_is_exact(tmp_path):
 def test_released_folder_is_written_back_as_it_was(shared_data, tmp_path):
     for folder in sorted((shared_data / "parity").iterdir()):
         model, _ = checkpoint.load(folder)
-        checkpoint.save(model, tmp_path / folder.name)
+        checkpoint.save(model.config, model.state_dict(), tmp_path / folder.name)
         assert json.loads((tmp_path / folder.name / "config.json").read_text()) == json.loads(
             (folder / "config.json").read_text()
         )
@@ -94,7 +94,8 @@ def test_released_folder_is_written_back_as_it_was(shared_data, tmp_path):
 def test_strict_loading_names_what_is_wrong(tmp_path):
     from safetensors.torch import load_file, save_file
 
-    checkpoint.save(RenderFormer(ModelConfig(**MICRO)), tmp_path / "a")
+    model = RenderFormer(ModelConfig(**MICRO))
+    checkpoint.save(model.config, model.state_dict(), tmp_path / "a")
 
     def broken(name: str) -> tuple:
         folder = tmp_path / name

@@ -7,7 +7,8 @@ import torch
 
 from model.config import ModelConfig
 from model.initial import start_informed
-from model.renderformer import RenderFormer, Triangles
+from model.inputs import Triangles
+from model.renderformer import RenderFormer
 
 TINY = {
     "latent_dim": 128, "num_heads": 1, "dim_feedforward": 256, "num_layers": 1, "num_register_tokens": 2,
@@ -26,7 +27,7 @@ def seen_from_the_right(model: RenderFormer, bright: int) -> torch.Tensor:
     material.requires_grad_()
     camera = torch.eye(4)
     camera[2, 3] = 1.75  # looks along -z at the origin
-    image = model(Triangles(triangles, normals, material), camera[None, None], torch.tensor([[45.0]]), (64, 64))[0, 0]
+    image = model(Triangles.pack(triangles, normals, material), camera[None, None], torch.tensor([[45.0]]), (64, 64))[0, 0]
     bundles = image.mean(-1).unflatten(0, (8, 8)).unflatten(2, (8, 8)).mean(dim=(1, 3))
     return torch.stack(
         [torch.autograd.grad(b, material, retain_graph=True)[0][0, bright].abs().sum() for b in bundles.flatten()]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -49,6 +50,85 @@ def test_lpips_from_files(tmp_path, network):
     assert torch.equal(metric(a, a), torch.zeros(2))
     near, far = metric(a, (a + 0.02).clamp(0, 1)), metric(a, 1 - a)
     assert (near > 0).all() and (far > near).all()
+
+
+# torchvision's networks: convolutions by number, as (stride, padding), after which the features are compared; "pool" between
+WRITTEN_OUT = {
+    "vgg": (
+        [0, 2, "pool", 5, 7, "pool", 10, 12, 14, "pool", 17, 19, 21, "pool", 24, 26, 28], {}, {2, 7, 14, 21, 28}, 2,
+    ),
+    "alex": ([0, "pool", 3, "pool", 6, 8, 10], {0: (4, 2), 3: (1, 2)}, {0, 3, 6, 8, 10}, 3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("network", ["vgg", "alex"])
+def test_lpips_equals_its_definition(tmp_path, network, monkeypatch):
+    """Zhang et al. 2018, equation 1, in float64 numpy from the files: convolutions as sums over shifted images."""
+    write_weights(tmp_path, network)
+    monkeypatch.setenv("LIGHTMILL_LPIPS", str(tmp_path))
+    metric = LPIPS.load(None, network)
+    features, linear = (
+        {key: value.double().numpy() for key, value in torch.load(tmp_path / spec[0], weights_only=True).items()}
+        for spec in (NETWORKS[network]["features"], NETWORKS[network]["linear"])
+    )
+    layers, geometry, compared, pool_size = WRITTEN_OUT[network]
+
+    def convolve(x, number):
+        weight, bias = features[f"features.{number}.weight"], features[f"features.{number}.bias"]
+        stride, padding = geometry.get(number, (1, 1))
+        x = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
+        rows, columns = ((n - weight.shape[-1]) // stride + 1 for n in x.shape[1:])
+        out = np.zeros((len(weight), rows, columns)) + bias[:, None, None]
+        for i, j in np.ndindex(weight.shape[2:]):
+            window = x[:, i : i + stride * rows : stride, j : j + stride * columns : stride]
+            out += np.tensordot(weight[:, :, i, j], window, axes=1)
+        return np.maximum(out, 0)
+
+    def pool(x):
+        rows, columns = ((n - pool_size) // 2 + 1 for n in x.shape[1:])
+        return np.max(
+            [x[:, i : i + 2 * rows : 2, j : j + 2 * columns : 2] for i, j in np.ndindex(pool_size, pool_size)], axis=0
+        )
+
+    def levels(image):
+        x = (2 * image - 1 - np.array([-0.030, -0.088, -0.188])[:, None, None]) / np.array([0.458, 0.448, 0.450])[:, None, None]
+        for layer in layers:
+            x = pool(x) if layer == "pool" else convolve(x, layer)
+            if layer in compared:
+                yield x / (np.sqrt((x**2).sum(axis=0)) + 1e-10)
+
+    rng = np.random.default_rng(3)
+    a, b = (rng.uniform(size=(3, 36, 40)) for _ in range(2))
+    expected = sum(
+        ((x - y) ** 2 * linear[f"lin{i}.model.1.weight"][0]).sum(axis=0).mean()
+        for i, (x, y) in enumerate(zip(levels(a), levels(b), strict=True))
+    )
+    found = metric(*(torch.from_numpy(image).float()[None] for image in (a, b))).item()
+    assert found == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_gradient_goes_through_the_tone_map(tmp_path):
+    """Of the LPIPS part alone, against finite differences; where the tone map clamps there is none."""
+    write_weights(tmp_path, "alex")
+    metric = LPIPS.load(tmp_path, "alex").double()
+    random = torch.Generator().manual_seed(5)
+    y = torch.rand(1, 1, 32, 32, 3, generator=random, dtype=torch.float64) * 0.2 + 0.05  # radiance up to 0.78
+    y[..., :8, :, :] = 0.5  # radiance 2.2: white
+    image = torch.rand(1, 1, 32, 32, 3, generator=random, dtype=torch.float64)
+
+    def distance(y):
+        a, b = (tone_map(x).flatten(0, 1).permute(0, 3, 1, 2) for x in (y, log_radiance(image)))
+        return metric(a, b).mean()
+
+    y.requires_grad_()
+    (gradient,) = torch.autograd.grad(distance(y), y)
+    assert (gradient[..., :8, :, :] == 0).all()
+    for _ in range(3):
+        direction = torch.randn(y.shape, generator=random, dtype=torch.float64)
+        step = 1e-6 * direction
+        with torch.no_grad():
+            slope = (distance(y + step) - distance(y - step)) / 2e-6
+        assert (gradient * direction).sum().item() == pytest.approx(slope.item(), rel=1e-3)
 
 
 def test_lpips_gradient_is_finite_also_on_black(tmp_path):

@@ -9,13 +9,20 @@ import numpy as np
 import pytest
 import torch
 
+from model import checkpoint
 from model.config import ModelConfig
+from model.flops import forward_flops
+from model.logs import LOG
+from model.optimization import schedule
+from model.parallel import Group
 from model.renderformer import RenderFormer
-from model.training import LOG, FitConfig, fit, predict, schedule
+from model.training import BEST, LAST, FitConfig, fit, predict
 from tests.model.synthetic import batch
 from tests.model.test_config import MICRO
 
 STEPS = 14
+ALONE = Group(torch.device("cpu"))
+MEASURED = ("seconds", "scenes_per_s", "tokens_per_s", "memory_gb", "mfu")  # of a log row; the rest must repeat exactly
 
 
 def settings(**fields) -> FitConfig:
@@ -34,23 +41,24 @@ def model_of(seed: int = 0) -> RenderFormer:
 def train(folder, batches=stream, validation=(), lines=None, **fields):
     model = model_of()
     log = (lambda text: None) if lines is None else lines.append
-    summary = fit(model, settings(**fields), batches, list(validation), folder, "cpu", log)
+    summary = fit(model, settings(**fields), batches, list(validation), folder, ALONE, log)
     return model, summary, [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
 
 
 def without_time(rows):
-    return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]
+    return [{name: value for name, value in row.items() if name not in MEASURED} for row in rows]
 
 
 class Killed(BaseException):
     pass
 
 
-@pytest.mark.parametrize("optimizer", ["adamw", "muon"])
+@pytest.mark.parametrize(("optimizer", "ema"), [("adamw", 0.0), ("muon", 0.9)])
 @pytest.mark.parametrize("killed_at", [3, 9, 12])  # before the first state; between states, a log line after the last one
-def test_killed_and_resumed_equals_undisturbed(tmp_path, optimizer, killed_at):
+def test_killed_and_resumed_equals_undisturbed(tmp_path, optimizer, ema, killed_at):
     validation = [batch(1000)]
-    whole, _, expected = train(tmp_path / "whole", validation=validation, optimizer=optimizer)
+    fields = {"validation": validation, "optimizer": optimizer, "ema": ema}
+    whole, _, expected = train(tmp_path / "whole", **fields)
 
     def dying(start, stop):
         for step in range(start, stop):
@@ -59,13 +67,16 @@ def test_killed_and_resumed_equals_undisturbed(tmp_path, optimizer, killed_at):
             yield batch(step)
 
     with pytest.raises(Killed):
-        train(tmp_path / "killed", dying, validation, optimizer=optimizer)
+        train(tmp_path / "killed", dying, **fields)
     with (tmp_path / "killed" / LOG).open("a") as file:
         file.write('{"step": 13, "lo')  # a line that the kill cut short
     torch.manual_seed(99)  # the state, not luck, brings the random numbers back
-    resumed, _, rows = train(tmp_path / "killed", validation=validation, optimizer=optimizer)
+    resumed, _, rows = train(tmp_path / "killed", **fields)
     assert without_time(rows) == without_time(expected)
     assert all(torch.equal(a, b) for a, b in zip(whole.parameters(), resumed.parameters(), strict=True))
+    for name in (LAST, BEST):
+        weights = [(tmp_path / run / name / "model.safetensors").read_bytes() for run in ("whole", "killed")]
+        assert weights[0] == weights[1]
 
 
 def test_learns_one_batch(tmp_path):
@@ -116,13 +127,92 @@ def test_a_run_of_non_finite_steps_stops(tmp_path):
         train(tmp_path, spoiled(range(1000)), steps=40)
 
 
+def test_parts_of_a_batch_add_up_to_its_gradient(tmp_path):
+    """micro_scenes only saves memory: same losses and weights, to rounding; textures follow their scenes."""
+
+    def stream(start, stop):
+        return (batch(step, scenes=3, padded=2, textured=True) for step in range(start, stop))
+
+    whole, _, rows = train(tmp_path / "whole", stream, log_every=1, clip=1e9)
+    split, _, same = train(tmp_path / "split", stream, log_every=1, clip=1e9, micro_scenes=2)
+    for a, b in zip(rows, same, strict=True):
+        assert b["loss"] == pytest.approx(a["loss"], rel=1e-4) and b["grad_norm"] == pytest.approx(a["grad_norm"], rel=1e-3)
+
+
+def test_averaged_weights_are_what_is_validated_and_saved(tmp_path):
+    model, summary, _ = train(tmp_path / "ema", validation=[batch(1000)], ema=0.9)
+    saved, _ = checkpoint.load(tmp_path / "ema" / LAST)
+    assert not torch.equal(saved.tri_token, model.tri_token)  # the trained model itself is left as it was
+    plain, _, _ = train(tmp_path / "plain", validation=[batch(1000)])
+    assert torch.equal(plain.tri_token, model.tri_token)
+    average = model_of().tri_token.detach().clone()
+
+    def replay(start, stop):  # the average by its definition, from the weights after each step
+        for step in range(start, stop):
+            yield batch(step)
+            average.mul_(0.9).add_(watched.tri_token.detach(), alpha=0.1)
+
+    watched = model_of()
+    fit(watched, settings(), replay, [], tmp_path / "replay", ALONE, lambda text: None)
+    torch.testing.assert_close(saved.tri_token.detach(), average)
+
+
+def test_best_and_last_are_kept(tmp_path):
+    """The best by validation is what it was at that step, though training goes on and gets worse."""
+    _, summary, rows = train(tmp_path, validation=[batch(1000)], validate_every=2, lr=0.03)
+    errors = [row["validation_log_error"] for row in rows if "validation_log_error" in row]
+    assert summary["best_log_error"] == min(errors) < errors[-1] == summary["log_error"]
+    last, best = (checkpoint.load(tmp_path / name)[0] for name in (LAST, BEST))
+    from model.training import evaluate
+
+    assert evaluate(best, [batch(1000)], ALONE)[0]["log_error"] == pytest.approx(min(errors), rel=1e-6)
+    assert evaluate(last, [batch(1000)], ALONE)[0]["log_error"] == pytest.approx(errors[-1], rel=1e-6)
+
+
+def test_tensorboard_has_the_log_and_the_pictures(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    seen = []
+
+    def show(step, pairs):
+        seen.append((step, len(pairs)))
+        return (np.clip(np.concatenate([np.hstack(pair) for pair in pairs]), 0, 1) * 255).astype(np.uint8)
+
+    validation = [batch(1000 + i) for i in range(3)]
+    fit(model_of(), settings(pictures=2), stream, validation, tmp_path, ALONE, lambda text: None, show, tmp_path / "events")
+    events = EventAccumulator(str(tmp_path / "events"))
+    events.Reload()
+    rows = [json.loads(line) for line in (tmp_path / LOG).read_text().splitlines()]
+    assert [e.value for e in events.Scalars("train/loss")] == pytest.approx([r["loss"] for r in rows if "loss" in r])
+    assert [e.step for e in events.Scalars("validation/psnr")] == [7, 14]
+    assert seen == [(7, 2), (14, 2)] and len(events.Images(events.Tags()["images"][0])) == 2
+
+
+def test_counted_operations_are_those_that_run():
+    from torch.nn.attention import SDPBackend, sdpa_kernel
+    from torch.utils.flop_counter import FlopCounterMode
+
+    for fields in ({}, {"use_dpt_decoder": False}, {"pe_type": "nerf"}, {"view_transformer_include_self_attn": False}):
+        model = RenderFormer(ModelConfig(**(MICRO | dict(latent_dim=256, num_heads=2, view_transformer_latent_dim=256,
+                                                         view_transformer_n_heads=2) | fields)))  # fmt: skip
+        data = batch(0, triangles=200, padded=50, views=3, resolution=64)
+        # torch's counter knows attention as matrix products only
+        with FlopCounterMode(display=False) as counter, torch.no_grad(), sdpa_kernel(SDPBackend.MATH):
+            predict(model, model, data, "cpu", "fp32")
+        counted = sum(forward_flops(model.config, [150, 200], 3, 64, 64).values())
+        assert counted == counter.get_total_flops()
+
+
 def test_schedule():
+    def schedule_of(config, step):
+        return schedule(step, config.steps, config.warmup, config.decay_steps, config.final_lr)
+
     config = settings(steps=100, warmup=10)
-    rates = [schedule(config, step) for step in range(100)]
+    rates = [schedule_of(config, step) for step in range(100)]
     assert rates[0] == pytest.approx(0.1) and max(rates) == rates[9] == rates[10] == 1.0
     assert all(a >= b for a, b in zip(rates[10:], rates[11:], strict=False)) and rates[-1] < 0.01
     long = settings(steps=130, warmup=10, decay_steps=100, final_lr=0.1)
-    assert schedule(long, 100) == schedule(long, 129) == pytest.approx(0.1)
+    assert schedule_of(long, 100) == schedule_of(long, 129) == pytest.approx(0.1)
 
 
 def test_gradient_leak_revives_negative_pixels_and_changes_no_value():
@@ -133,7 +223,7 @@ def test_gradient_leak_revives_negative_pixels_and_changes_no_value():
     for leak in (0.0, 0.1):
         model.view_transformer.gradient_leak = leak
         model.zero_grad()
-        y = predict(model, model, data, "cpu", False)
+        y = predict(model, model, data, "cpu", "fp32")
         y.mean().backward()
         found.append((y.detach(), model.tri_token.grad.abs().sum()))
     assert (found[0][0] < 0).all() and torch.equal(found[0][0], found[1][0])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+import shutil
 import subprocess
 import sys
 
@@ -42,7 +45,8 @@ def trained(shard, tmp_path_factory):
 def test_products(trained, shard):
     draft, products = trained
     assert products == ["checkpoint/config.json", "checkpoint/model.safetensors"]
-    assert all((draft.files / name).is_file() for name in [*products, "log.jsonl", "curve.png"])
+    assert all((draft.files / name).is_file() for name in [*products, "log.jsonl", "curve.png", "best/model.safetensors"])
+    assert list((draft.files / "tensorboard").glob("events.*"))
     assert draft.notes["training"]["steps"] == 4
     sample = shard.ids("validation")[0]
     scene = decode_sample(shard.read(sample)).scene
@@ -50,13 +54,116 @@ def test_products(trained, shard):
     assert images.shape == (2, 16, 16, 3) and images.dtype == np.float32 and (images >= 0).all()
 
 
+def test_validation_is_shown_in_pictures(trained, shard):
+    """Reference above, prediction below, one column per scene, at the exposure that suits the reference."""
+    from PIL import Image
+
+    from stages.dataset import decode_sample
+    from stages.tonemap import exposure_for, to_picture
+
+    (path,) = sorted((trained[0].files / "validation").iterdir())
+    picture = np.asarray(Image.open(path))
+    count = len(shard.ids("validation"))
+    assert path.name == "step-0000004.png" and picture.shape == (32, 16 * min(6, count), 3)
+    first = decode_sample(shard.read(shard.ids("validation")[0]))
+    reference = first.views[min(first.views)].image
+    assert np.array_equal(picture[:16, :16], to_picture(reference, exposure_for(reference)))
+
+
 def test_same_seed_same_bytes(trained, shard, tmp_path):
     draft, products = trained
     other = FakeArtifact(tmp_path, [])
     other.state = tmp_path / "state"
-    Train().run(config(ahead=1, log_every=3), {"shard": shard}, other)
+    settings = {"ahead": 1, "log_every": 3, "pictures": 0, "tensorboard": False, "activation_checkpointing": True}
+    Train().run(config(**settings), {"shard": shard}, other)
     for name in products:
         assert (other.files / name).read_bytes() == (draft.files / name).read_bytes()
+
+
+def train_on(shard, path, **fields):
+    draft = FakeArtifact(path, [])
+    draft.state = path / "state"
+    said = []
+    draft.log = said.append
+    Train().run(config(**fields), {"shard": shard}, draft)
+    return draft, said
+
+
+def test_a_second_run_starts_from_the_first_ones_weights(trained, shard, tmp_path):
+    """The curriculum's second stage: equal at a learning rate of nothing; its key follows the weights, not their path."""
+    from pipeline.files import hash_file
+    from pipeline.stage import StageConfig
+
+    first = trained[0].files / "checkpoint"
+    draft, said = train_on(shard, tmp_path / "second", init_from=str(first), lr=1e-30, muon_lr=1e-30, weight_decay=0.0)
+    assert f"starting from {first}" in said[0]
+    a, b = (load_model(folder / "checkpoint").state_dict() for folder in (trained[0].files, draft.files))
+    assert all(np.allclose(a[name], b[name], atol=1e-6) for name in a)
+    assert issubclass(TrainConfig, StageConfig)
+    elsewhere = tmp_path / "artifact" / "files" / "checkpoint"
+    shutil.copytree(first, elsewhere)
+    stage = Train()
+    identities = [stage.identity(config(init_from=str(path)), hash_file) for path in (first, tmp_path / "artifact")]
+    assert identities[0] == identities[1] and stage.identity(config(), hash_file) == {}
+    (elsewhere / "model.safetensors").write_bytes(b"other")
+    assert stage.identity(config(init_from=str(tmp_path / "artifact")), hash_file) != identities[0]
+    with pytest.raises(UserError, match="holds no checkpoint"):
+        stage.identity(config(init_from=str(tmp_path / "nothing")), hash_file)
+    with pytest.raises(UserError, match="dim_feedforward 64 instead of 32"):
+        train_on(shard, tmp_path / "third", init_from=str(first), model=MODEL | {"dim_feedforward": 32})
+
+
+def test_killed_at_any_step_and_resumed_is_the_same_run(shard, tmp_path, monkeypatch):
+    """Through the real loader; tests/resume.py does it with real kills."""
+    import stages.dataset
+
+    settings = {"steps": 9, "checkpoint_every": 4, "log_every": 1, "relight": True, "mirror": True, "ema": 0.9}
+    whole, _ = train_on(shard, tmp_path / "whole", **settings)
+    real, resumed = stages.dataset.prefetch, None
+    for killed_at in (2, 6, None):
+
+        def prefetch(batches, start, stop, *arguments, killed_at=killed_at):
+            for step, batch in enumerate(real(batches, start, stop, *arguments), start=start):
+                if step == killed_at:
+                    raise KeyboardInterrupt
+                yield batch
+
+        monkeypatch.setattr(stages.dataset, "prefetch", prefetch)
+        if killed_at is None:
+            resumed, said = train_on(shard, tmp_path / "killed", **settings)
+            assert "going on from step 4 of 9" in said
+        else:
+            with pytest.raises(KeyboardInterrupt):
+                train_on(shard, tmp_path / "killed", **settings)
+    measured = {"seconds", "scenes_per_s", "tokens_per_s", "memory_gb", "mfu"}
+    logs = [draft.file("log.jsonl").read_text().splitlines() for draft in (whole, resumed)]
+    rows = [[{k: v for k, v in json.loads(line).items() if k not in measured} for line in lines] for lines in logs]
+    assert rows[0] == rows[1] and len([row for row in rows[0] if "loss" in row]) == 9
+    weights = [(draft.files / "checkpoint" / "model.safetensors").read_bytes() for draft in (whole, resumed)]
+    assert weights[0] == weights[1]
+
+
+@pytest.mark.parametrize(("name", "days", "paths"), [("paper_256", 5.2, 2.15e15), ("paper_512", 5.5, 8.59e15)])
+def test_the_papers_experiments_say_what_they_cost(name, days, paths, tmp_path):
+    """Planned, not run; the authors report 5 and 3 days on eight A100."""
+    from pipeline.hydra_config import compose
+    from pipeline.runner import run_pipeline
+
+    (tmp_path / "ids.txt").write_text("some uids\n")
+    words = [
+        f"experiment={name}",
+        f"collect.ids_file={tmp_path / 'ids.txt'}",
+        "stage=train",
+        "plan=true",
+        f"store={tmp_path}/s",
+    ]
+    lines = []
+    run_pipeline(compose(words), words, lines.append)
+    text = "\n".join(lines)
+    assert float(re.search(r"([\d.]+) of eight", text)[1]) == pytest.approx(days, abs=0.05)
+    assert f"{paths:.2e} camera paths" in text
+    assert "2,000,000 training scenes" in text and "steps of 128 scenes x 4 views" in text
+    assert not list((tmp_path / "s").glob("*/*"))
 
 
 def test_resolution_must_suit_the_model(shard, tmp_path):
@@ -91,6 +198,28 @@ def test_predict_writes_images(trained, shared_data, tmp_path, capsys):
     assert read_rgb(exr).shape == (16, 16, 3)
     paths = predict(scene, checkpoint, tmp_path / "all.png", resolution=16, view="all")
     assert paths[0].name == "all-0.png" and Image.open(paths[0]).size == (16, 16)
+
+
+def test_without_a_checkpoint_the_shipped_model_is_used(trained, shared_data, tmp_path, monkeypatch, capsys):
+    import stages.predict
+    from stages.cli import main
+
+    scene = next(path for path in sorted((shared_data / "scenes").rglob("*.h5")))
+    words = ["predict", str(scene), "-o", str(tmp_path / "out.png"), "--resolution", "16", "--device", "cpu"]
+    monkeypatch.setattr(stages.predict, "PRETRAINED", tmp_path / "none")
+    assert main(words) == 2 and "no model ships" in capsys.readouterr().err
+    monkeypatch.setattr(stages.predict, "PRETRAINED", trained[0].files / "checkpoint")
+    assert main(words) == 0 and (tmp_path / "out.png").is_file()
+
+
+def test_what_ships_is_small_and_has_its_report():
+    from stages.predict import PRETRAINED
+
+    if not (PRETRAINED / "config.json").is_file():
+        pytest.skip("no model ships yet")
+    load_model(PRETRAINED)
+    assert sum(path.stat().st_size for path in PRETRAINED.iterdir()) <= 50e6
+    assert "python -m pipeline" in (PRETRAINED / "report.md").read_text()
 
 
 @pytest.mark.parametrize(

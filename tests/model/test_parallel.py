@@ -1,0 +1,47 @@
+"""Many processes follow the run of one, and can take it over from one another."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from model import checkpoint
+from model.logs import LOG
+from model.training import BEST, LAST
+
+RANKS = Path(__file__).with_name("ranks.py")
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+
+
+def run(*words: object, start: list[str]) -> subprocess.CompletedProcess:
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.run([*start, str(RANKS), *map(str, words)], capture_output=True, text=True, env=environment)
+
+
+def rows(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
+
+
+def test_two_processes_follow_one_and_share_its_checkpoints(tmp_path):
+    """50 steps alone; then 27 by two DDP processes with half the batch each, killed, and the rest by two FSDP processes."""
+    alone, shared = tmp_path / "alone", tmp_path / "shared"
+    assert run(alone, "ddp", start=[sys.executable]).returncode == 0
+    assert run(shared, "ddp", 27, start=TORCHRUN).returncode != 0
+    assert rows(shared)[-1]["step"] == 27
+    resumed = run(shared, "fsdp", start=TORCHRUN)
+    assert resumed.returncode == 0, resumed.stderr
+    one, two = rows(alone), rows(shared)
+    assert [row["step"] for row in one] == [row["step"] for row in two]
+    for a, b in zip(one, two, strict=True):
+        for name in ("loss", "validation_log_error"):
+            assert b.get(name) == pytest.approx(a.get(name), abs=1e-4) if name in a else name not in b
+    for name in (LAST, BEST):
+        a, b = (checkpoint.load(folder / name)[0].state_dict() for folder in (alone, shared))
+        assert all((a[key] - b[key]).abs().max() < 1e-3 for key in a)
+    assert torch.load(shared / "training.pt", weights_only=True)["plain"]["step"] == 50
