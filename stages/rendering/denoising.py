@@ -10,8 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 
-def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, coverage: np.ndarray) -> np.ndarray:
-    """(H, W, 3) float32 denoised radiance, not negative, and black where no sample of the pixel hit anything."""
+def denoise(
+    radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, coverage: np.ndarray, quality: str = "high"
+) -> np.ndarray:
+    """(H, W, 3) float32 denoised radiance, not negative, and black where no sample of the pixel hit anything.
+
+    ``quality``: high, balanced or fast, networks of which each takes about twice the time of the next.
+    """
     import pyoidn
 
     if not radiance.any():
@@ -22,5 +27,6 @@ def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, covera
         np.ascontiguousarray(normal, np.float32),
         hdr=True,
         clean_aux=True,
+        quality=quality,
     )
     return np.where(coverage[..., None] > 0, np.maximum(clean, 0), 0).astype(np.float32)

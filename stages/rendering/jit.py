@@ -6,8 +6,8 @@ came from. The integrator keeps its own light arrays, picks a light triangle by 
 and knows a light that a ray hits by its triangle index. Next-event estimation and BSDF sampling are combined by the
 power heuristic.
 
-One lane of the kernel traces BLOCK samples of a pixel, the next one as soon as a path ends, and keeps their sums: lanes
-of a vector stay busy, and nothing is added by atomics. The host adds a pixel's blocks in order. A sample is a function of
+One lane of the kernel traces a block of 8 to 64 samples of a pixel, the next one as soon as a path ends, and keeps their sums:
+lanes of a vector stay busy, and nothing is added by atomics. The host adds a pixel's blocks in order. A sample is a function of
 (seed, stream, view, pixel, number) only: the bytes are the same for any thread count and any chunk size.
 """
 
@@ -26,7 +26,9 @@ from stages.rendering.sobol import Sampler, mixed
 from stages.rendering.sums import Sums
 from stages.rendering.surfaces import floats, shape_mesh
 
-BLOCK = 8  # samples of a lane: also the steps in which samples can be asked for
+BLOCKS = (8, 64)  # samples of a lane, least and most
+LANES = 1 << 15  # of a view: enough to keep processors busy, so that lanes take more samples each
+GROUP = 64  # blocks of a pixel that the host adds at once
 CHUNK = 1 << 19  # lanes in flight: 40 floats of results each, about 80 MB
 RR_DEPTH = 5  # bounces before Russian roulette may end a path
 FILTER_CELLS = 1024
@@ -267,7 +269,7 @@ class JitRenderer:
     def sample(self, views: list[int], streams: list[int], first: int, spp: int) -> list[list[Sums]]:
         """Per stream, the sums of each view over the stream's samples ``first`` to ``first + spp`` of every pixel.
 
-        Streams share no path. ``first`` is a multiple of BLOCK. A path serves all lights.
+        Streams share no path. A path serves all lights.
         """
         pixels = self.resolution * self.resolution
         ids = np.concatenate([view * pixels + np.arange(pixels) for view in views])
@@ -293,26 +295,34 @@ class JitRenderer:
         first: int,
         spp: int,
     ) -> dict[str, np.ndarray]:
-        """(streams, pixels, ..) sums over the samples, float64; ``lights`` (.., SLOTS, 3)."""
-        blocks = -(-spp // BLOCK)
-        lane_count = len(streams) * len(ids) * blocks
-        results: dict[str, list[np.ndarray]] = {}
-        for start in range(0, lane_count, CHUNK):
-            lane = np.arange(start, min(start + CHUNK, lane_count))
-            row, block = lane // blocks, lane % blocks
-            stream = np.asarray(streams)[row // len(ids)]
-            counts = np.minimum(BLOCK, spp - block * BLOCK)
-            values = self._chunk(table, number, rays, ids[row % len(ids)], stream, first + block * BLOCK, counts)
-            for name, value in values.items():
-                results.setdefault(name, []).append(value)
-        whole = {name: np.concatenate(parts, axis=-1) for name, parts in results.items()}
-
-        def shaped(values: np.ndarray) -> np.ndarray:  # (.., lanes) -> (streams, pixels, blocks, ..)
-            return np.moveaxis(values.reshape(*values.shape[:-1], len(streams), len(ids), blocks), (-3, -2, -1), (0, 1, 2))
-
-        summed = ("lights", "direct", "albedo", "normal", "distance", "hits")
-        sums = {name: shaped(whole[name]).sum(axis=2, dtype=np.float64) for name in summed}
-        return sums | {"nearest": shaped(whole["nearest"]).min(axis=2), "triangle": shaped(whole["triangle"])[:, :, 0]}
+        """(streams, pixels, ..) sums over the samples, float64; ``lights`` (.., lights of the pass, 3)."""
+        # of resolution and samples alone, since it decides how sums are rounded
+        fitting = self.resolution**2 * spp // LANES
+        size = min(max(1 << fitting.bit_length() >> 1, BLOCKS[0]), BLOCKS[1])
+        rows, blocks = len(streams) * len(ids), -(-spp // size)
+        sums: dict[str, np.ndarray] = {}
+        for block in range(0, blocks, GROUP):
+            depth = min(GROUP, blocks - block)
+            step = max(CHUNK // depth, 1)
+            for start in range(0, rows, step):
+                row = np.arange(start, min(start + step, rows)).repeat(depth)
+                number_of = block + np.tile(np.arange(depth), len(row) // depth)
+                counts = np.minimum(size, spp - number_of * size)
+                where = ids[row % len(ids)], np.asarray(streams)[row // len(ids)], first + number_of * size, counts
+                for name, value in self._chunk(table, number, rays, *where).items():
+                    parts = value.reshape(*value.shape[:-1], -1, depth)
+                    part = slice(start, start + parts.shape[-2])
+                    if name == "triangle":
+                        total = sums.setdefault(name, np.zeros(rows, np.int32))
+                        total[part] = parts[:, 0] if block == 0 else total[part]
+                    elif name == "nearest":
+                        total = sums.setdefault(name, np.full(rows, np.inf, np.float32))
+                        total[part] = np.minimum(total[part], parts.min(axis=-1))
+                    else:
+                        total = sums.setdefault(name, np.zeros((*value.shape[:-1], rows)))
+                        total[..., part] += parts.sum(axis=-1, dtype=np.float64)
+        shape = (len(streams), len(ids))
+        return {name: np.moveaxis(total, -1, 0).reshape(*shape, *total.shape[:-1]) for name, total in sums.items()}
 
     def _chunk(
         self,
@@ -330,7 +340,7 @@ class JitRenderer:
             return dr.opaque(mi.UInt32, value & 0xFFFFFFFF)
 
         ids, streams = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(stream.astype(np.uint32))
-        # one to one in the pixel for a given seed, so no two pixels of a scene share their numbers
+        # the first two steps are one to one in the pixel: no two pixels of a stream share their numbers
         key = mixed(mixed(mixed(ids + opaque(self.seed)) + opaque(self.seed >> 32)) + streams)
         lanes = Lanes(rays, ids, key, mi.UInt32(first.astype(np.uint32)), mi.UInt32(count.astype(np.uint32)))
         limits = self.limits
@@ -348,7 +358,7 @@ class JitRenderer:
         slots, *wide, distances, hits, nearest, triangle = out
         size = len(pixel)
         return {
-            "lights": np.stack([_channels(slot, size) for slot in slots]),
+            "lights": np.stack([_channels(slot, size) for slot in slots[: table.slots]]),
             **{name: _channels(value, size) for name, value in zip(("direct", "albedo", "normal"), wide, strict=True)},
             "distance": distances.numpy(),
             "hits": hits.numpy(),

@@ -46,6 +46,7 @@ class LightTable:
         density = np.zeros(len(power))  # per unit area
         density[chosen] = power[chosen] / power[chosen].sum() / np.maximum(0.5 * length[chosen], 1e-30)
 
+        self.slots = min(max(scene.n_lights - first, 1), SLOTS)  # in use, one at least
         self.slot = mi.Int32(slot.astype(np.int32))
         self.emission = floats(emission)
         self.density = floats(density)

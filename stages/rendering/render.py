@@ -22,7 +22,7 @@ from stages.exr import clamped_values
 from stages.records import SceneRecord, ViewRecord
 from stages.rendering import backend as backends
 from stages.rendering.denoising import denoise as denoise_layer
-from stages.rendering.error import estimated_error
+from stages.rendering.error import QUALITIES, estimated_error
 from stages.rendering.sums import Sums
 
 MODES = ("physical", "cycles")
@@ -50,8 +50,8 @@ def render_views(
 
     max_spp: camera paths per pixel for the image with all lights on, at most. The JIT integrator shares each path among all
         lights; the scalar one gives each light its share of the paths.
-    target_error: a view gets 16 samples, and as many again as it has, until its estimated error (``stages.rendering.error``)
-        is at most this; 0: ``max_spp`` at once, and no estimate.
+    target_error: a view gets 16 samples, then 32, 48, 64, 96, 128, 192 .. until its estimated error
+        (``stages.rendering.error``) is at most this; 0: ``max_spp`` at once, and no estimate.
     backend: from ``stages.rendering.backend.choose``. max_depth: longest path in segments; 2 is direct light only.
     lights_visible: whether camera rays see lights (reflections always do).
     """
@@ -75,21 +75,32 @@ def render_views(
         taken += step
         left = []
         for view in active:
-            if 2 * taken <= due[view] and taken < total:  # even twice as many would not do
+            if 1.5 * taken <= due[view] and taken < total:  # even the next count would not do
                 left.append(view)
                 continue
             parts = list(halves[view].values())
             sums = functools.reduce(operator.add, parts)
             seen, *others = (part.view(scene.object_index) for part in (sums, *parts))
-            estimate = estimated_error(*others, seen, denoise) if len(others) > 1 else None
-            if taken < total and estimate is not None and estimate > target_error:
-                due[view] = taken * (estimate / target_error) ** 2  # no error falls faster than by the square root
+            quality, error = "high", None
+            if len(others) > 1:
+                estimate = estimated_error(*others, seen, denoise)
+                # the cheaper network where it meets the target, the better one where it does not
+                qualities = QUALITIES if denoise else {"high": 1.0}
+                quality = next((name for name, factor in qualities.items() if estimate * factor <= target_error), "high")
+                error = estimate * qualities[quality]
+            if taken < total and error is not None and error > target_error:
+                due[view] = taken * (error / target_error) ** 2  # no error falls faster than by the square root
                 left.append(view)
             else:
                 del halves[view]
-                records[view] = _finish(seen, sums, view, denoise, estimate)
-        active, step = left, min(taken, total - taken)
+                records[view] = _finish(seen, sums, view, quality if denoise else None, error)
+        active, step = left, min(_next(taken) - taken, total - taken)
     return [records[view] for view in order]
+
+
+def _next(samples: int) -> int:
+    """Of 16, 24, 32, 48, 64, 96 .. the one after ``samples``; 16 after 8."""
+    return samples * 3 // 2 if samples & (samples - 1) == 0 and samples > 8 else samples * 4 // 3 if samples > 8 else 16
 
 
 def _sampler(
@@ -119,13 +130,13 @@ def _sampler(
     return JitRenderer(scene, resolution, seed, limits, lights_visible).sample
 
 
-def _finish(view: ViewRecord, sums: Sums, index: int, denoise: bool, error: float | None) -> ViewRecord:
-    """The stored view: every light denoised on its own, and what is to be said of it."""
+def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error: float | None) -> ViewRecord:
+    """The stored view: every light denoised on its own (quality None: not at all), and what is to be said of it."""
     nearest = float(sums.nearest.min())
-    if denoise:
+    if quality:
 
         def clean(radiance: np.ndarray) -> np.ndarray:
-            return denoise_layer(radiance, view.albedo, view.normal, view.coverage)
+            return denoise_layer(radiance, view.albedo, view.normal, view.coverage, quality)
 
         view.lights = np.stack([clean(light) for light in view.lights]) if len(view.lights) else view.lights
         view.direct = clean(view.direct)
@@ -136,6 +147,7 @@ def _finish(view: ViewRecord, sums: Sums, index: int, denoise: bool, error: floa
         "mean": mean,
         "spp": sums.spp,
         "error": error,
+        "denoiser": quality,
         "clamped": clamped_values(view),
         "nearest": nearest if np.isfinite(nearest) else None,
     }

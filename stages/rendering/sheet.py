@@ -130,8 +130,8 @@ def _layer_blocks(view: ViewRecord, exposure: float) -> list[Image.Image]:
         _tile(_grey(fit(normal)), "normal, world"),
         _tile(_grey(fit(depth)), f"depth {near:.2f} to {far:.2f}"),
         _tile(_grey(fit(view.coverage)), "coverage"),
-        _tile(_colours(view.object), "object of the first sample"),
-        _tile(_colours(view.triangle), "triangle of the first sample"),
+        _tile(_colours(view.object), "object"),
+        _tile(_colours(view.triangle), "triangle"),
     ]
     blocks += [Image.new("RGB", (CELL, CELL + LINE), "white") for _ in range(COLUMNS - len(blocks))]
     for index, light in enumerate(view.lights[:COLUMNS]):

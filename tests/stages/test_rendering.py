@@ -258,11 +258,15 @@ def test_bytes_do_not_depend_on_threads(backend):
 def test_bytes_do_not_depend_on_views_or_chunks(jit, monkeypatch):
     from stages.rendering import jit as module
 
-    scene = clutter()
-    whole = hashed(render_views(scene, 16, max_spp=8, seed=2, backend=jit, denoise=False))
-    assert hashed(render_views(scene, 16, max_spp=8, seed=2, backend=jit, denoise=False, views=[1])) == whole[1:]
-    monkeypatch.setattr(module, "CHUNK", 1000)  # 15 samples at most in flight per pixel
-    assert hashed(render_views(scene, 16, max_spp=8, seed=2, backend=jit, denoise=False)) == whole
+    scene, kept = clutter(), {"max_spp": 44, "seed": 2, "backend": jit, "denoise": False}
+    whole = render_views(scene, 16, **kept)
+    assert hashed(render_views(scene, 16, views=[1], **kept)) == hashed(whole)[1:]
+    monkeypatch.setattr(module, "CHUNK", 100)  # lanes, of six blocks for each pixel
+    assert hashed(render_views(scene, 16, **kept)) == hashed(whole)
+    monkeypatch.setattr(module, "GROUP", 4)  # blocks in flight for each pixel: memory is bounded at any number of samples
+    for a, b in zip(render_views(scene, 16, **kept), whole, strict=True):
+        np.testing.assert_allclose(a.lights, b.lights, rtol=1e-6)
+        assert np.array_equal(a.triangle, b.triangle) and a.meta["nearest"] == b.meta["nearest"]
 
 
 def test_denoiser_gives_the_same_bytes_for_any_thread_count():
