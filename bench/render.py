@@ -342,40 +342,29 @@ class BuiltIn:
     def __init__(self, scene: SceneRecord, resolution: int):
         import mitsuba as mi
 
-        from stages.rendering.surfaces import mesh_of, surface_mesh
+        from stages.rendering.scalar import perspective
+        from stages.rendering.surfaces import face_normals, mesh_of, surface_mesh
 
         surfaces, lights = np.nonzero(scene.light_index < 0)[0], scene.light_index >= 0
         shapes = {"surface": surface_mesh(scene, surfaces)}
         for radiance in np.unique(scene.emission[lights], axis=0):
             front = scene.triangles[lights & (scene.emission == radiance).all(axis=1)]
             for side in (front, front[:, ::-1]):
-                normal = np.cross(side[:, 1] - side[:, 0], side[:, 2] - side[:, 0])
+                normal = face_normals(side)
                 normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
                 ahead = scene.triangles[surfaces].reshape(-1, 3) @ normal.T > (normal * side[:, 0]).sum(axis=1)
                 shine = {"type": "rgb", "value": radiance.tolist()}
                 emitter = mi.load_dict({"type": "area", "radiance": shine, "sampling_weight": float(ahead.any())})
                 shapes[f"light{len(shapes)}"] = mesh_of(side + 1e-5 * normal[:, None], None, emitter=emitter)
         self.scene = mi.load_dict({"type": "scene", **shapes})
-        turn = np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba looks along +z with +x to the left
-        film = {"type": "hdrfilm", "width": resolution, "height": resolution, "pixel_format": "rgb", "rfilter": {"type": "box"}}
-        self.sensor = mi.load_dict(
-            {
-                "type": "perspective",
-                "fov": float(scene.fov_deg[0]),
-                "near_clip": 1e-4,
-                "far_clip": 1e4,
-                "to_world": mi.ScalarTransform4f(scene.camera_to_world[0].astype(np.float64) @ turn),
-                "film": film | {"component_format": "float32"},
-                "sampler": {"type": "independent"},
-            }
-        )
+        self.sensor = perspective(scene, 0, resolution)
         self.integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
 
     def render(self, spp: int, seed: int) -> np.ndarray:
         """(H, W, 3) image"""
         import mitsuba as mi
 
-        return np.array(mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=spp, seed=seed))
+        return np.array(mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=spp, seed=seed))[..., :3]
 
 
 def warm_up(scene: SceneRecord, backend: dict[str, Any], threads: int) -> None:

@@ -7,6 +7,7 @@ right one; ``runtime`` fields (workers, devices, logging) stay out of keys.
 from __future__ import annotations
 
 import difflib
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -92,3 +93,13 @@ def parse(kind: Any, data: Any, where: str) -> Any:
             else:
                 lines.append(f"{path}={problem.get('input')!r}: {problem['msg']}")
         raise UserError("; ".join(lines)) from None
+
+
+def existing_folder(setting: str, path: str | None, needed: str) -> Path:
+    """The folder that the setting names; ``needed`` says what needs it, for the error where there is none."""
+    if path is None:
+        raise UserError(f"{needed}: {setting}=DIR")
+    root = Path(path).expanduser()
+    if not root.is_dir():
+        raise UserError(f"{setting}={path!r} is not a folder")
+    return root

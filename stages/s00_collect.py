@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from pipeline.config import StageConfig, added, count, runtime
+from pipeline.config import StageConfig, added, count, existing_folder, runtime
 from pipeline.errors import Reject, UserError
 from pipeline.keys import seed_for
 from pipeline.stage import Inputs, Item, MapStage, Record
@@ -252,12 +252,7 @@ def made_up_texture(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Gene
 
 
 def _folder(config: FolderConfig) -> Path:
-    if config.path is None:
-        raise UserError("collect=folder needs a folder: collect.path=DIR")
-    root = Path(config.path).expanduser()
-    if not root.is_dir():
-        raise UserError(f"collect.path={config.path!r} is not a folder")
-    return root
+    return existing_folder("collect.path", config.path, "collect=folder needs a folder")
 
 
 def mesh_files(config: FolderConfig) -> list[str]:

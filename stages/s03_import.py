@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from pipeline.config import StageConfig, runtime
+from pipeline.config import StageConfig, existing_folder, runtime
 from pipeline.errors import Reject, UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 
@@ -85,12 +85,7 @@ class ImportScene(MapStage):
 
 
 def folder_of(config: ImportConfig) -> Path:
-    if config.path is None:
-        raise UserError("scene=imported needs a folder of scenes: scene.path=DIR")
-    root = Path(config.path).expanduser()
-    if not root.is_dir():
-        raise UserError(f"scene.path={config.path!r} is not a folder")
-    return root
+    return existing_folder("scene.path", config.path, "scene=imported needs a folder of scenes")
 
 
 def scene_files(root: Path) -> list[str]:

@@ -15,7 +15,7 @@ def denoise(
 ) -> np.ndarray:
     """(H, W, 3) float32 denoised radiance, not negative, and black where no sample of the pixel hit anything.
 
-    ``quality``: high, balanced or fast, networks of which each takes about twice the time of the next.
+    ``quality``: high or balanced, the denoiser's large and middle networks; the large one takes twice the time.
     """
     import pyoidn
 

@@ -16,6 +16,7 @@ import numpy as np
 from stages.metrics import log_error
 from stages.records import ViewRecord
 from stages.rendering.denoising import denoise
+from stages.tonemap import log_encode
 
 NOISE_WEIGHT = 0.5  # of the mean difference between the denoised halves
 DRIFT_WEIGHT = 1.6  # of the mean difference between their mean and the denoised whole
@@ -28,7 +29,7 @@ def estimated_error(a: ViewRecord, b: ViewRecord, whole: ViewRecord, denoised: b
     if not denoised:
         return 0.5 * log_error(a.image, b.image)
     first, second, now = (
-        np.log10(1 + denoise(v.image, v.albedo, v.normal, v.coverage, "balanced").astype(np.float64)) for v in (a, b, whole)
+        log_encode(denoise(v.image, v.albedo, v.normal, v.coverage, "balanced").astype(np.float64)) for v in (a, b, whole)
     )
     noise, drift = np.abs(first - second).mean(), np.abs((first + second) / 2 - now).mean()
     return float(NOISE_WEIGHT * noise + DRIFT_WEIGHT * drift)

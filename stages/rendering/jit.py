@@ -24,7 +24,7 @@ from stages.rendering.lights import SLOTS, LightTable
 from stages.rendering.material import Material
 from stages.rendering.sobol import Sampler, mixed
 from stages.rendering.sums import Sums
-from stages.rendering.surfaces import floats, shape_mesh
+from stages.rendering.surfaces import Surfaces, floats, shape_mesh
 
 BLOCKS = (8, 64)  # samples of a lane, least and most
 LANES = 1 << 15  # of a view: enough to keep processors busy, so that lanes take more samples each
@@ -251,8 +251,9 @@ class JitRenderer:
     def __init__(self, scene: SceneRecord, resolution: int, seed: int, limits: Limits, lights_visible: bool):
         self.record, self.resolution, self.seed = scene, resolution, seed
         self.limits, self.lights_visible = limits, lights_visible
-        self.scene = mi.load_dict({"type": "scene", "surface": shape_mesh(scene)})
-        self.material = Material(scene, limits.multiscatter)
+        surfaces = Surfaces(scene, np.arange(len(scene.triangles)))
+        self.scene = mi.load_dict({"type": "scene", "surface": shape_mesh(scene, surfaces)})
+        self.material = Material(surfaces, limits.multiscatter)
         self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
         self.cameras = Cameras(scene, resolution, limits.filter)
 

@@ -14,7 +14,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from stages.records import SceneRecord
 from stages.rendering.surfaces import MIN_ALPHA, Surfaces, atlas_texture, floats
 
 CELLS = 32  # of the tables of directional albedo, per axis
@@ -65,10 +64,9 @@ class Lobes:
 
 
 class Material:
-    """The lobes of a scene's triangles; emitting ones are black."""
+    """The lobes of a scene's triangles, of which ``surfaces`` are all; emitting ones are black."""
 
-    def __init__(self, scene: SceneRecord, multiscatter: bool):
-        surfaces = Surfaces(scene, np.arange(len(scene.triangles)))
+    def __init__(self, surfaces: Surfaces, multiscatter: bool):
         self._pictures = {name: atlas_texture(surfaces.picture(name)) for name in sorted(surfaces.varying - {"albedo"})}
         self._values = {
             name: floats(surfaces.values[name]) for name in ("diffuse", "specular", "alpha") if name not in self._pictures

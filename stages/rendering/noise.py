@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.dataset import Relight, draw_light_factors
+from stages.dataset.augment import Relight, draw_light_factors, lit_by
 from stages.metrics import PSNR_MAX, log_error, psnr
 from stages.records import ViewRecord
 from stages.tonemap import clamp
@@ -49,7 +49,7 @@ def error_of_one(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
 
 def relit(view: ViewRecord, factors: np.ndarray) -> np.ndarray:
     """(H, W, 3) radiance with the lights' radiance multiplied by ``factors`` (L, 3)."""
-    return np.einsum("lhwc,lc->hwc", view.lights, factors.astype(np.float32))
+    return lit_by(view.lights, factors.astype(np.float32))
 
 
 def pair_error(a: ViewRecord, b: ViewRecord, rng: np.random.Generator) -> dict[str, Any]:

@@ -80,10 +80,10 @@ def render_views(
                 continue
             parts = list(halves[view].values())
             sums = functools.reduce(operator.add, parts)
-            seen, *others = (part.view(scene.object_index) for part in (sums, *parts))
+            seen = sums.view(scene.object_index)
             quality, error = "high", None
-            if len(others) > 1:
-                estimate = estimated_error(*others, seen, denoise)
+            if len(parts) > 1:
+                estimate = estimated_error(*(part.view(scene.object_index) for part in parts), seen, denoise)
                 # the cheaper network where it meets the target, the better one where it does not
                 qualities = QUALITIES if denoise else {"high": 1.0}
                 quality = next((name for name, factor in qualities.items() if estimate * factor <= target_error), "high")
@@ -100,7 +100,10 @@ def render_views(
 
 def _next(samples: int) -> int:
     """Of 16, 24, 32, 48, 64, 96 .. the one after ``samples``; 16 after 8."""
-    return samples * 3 // 2 if samples & (samples - 1) == 0 and samples > 8 else samples * 4 // 3 if samples > 8 else 16
+    if samples <= 8:
+        return 16
+    power_of_two = samples & (samples - 1) == 0
+    return samples * 3 // 2 if power_of_two else samples * 4 // 3
 
 
 def _sampler(

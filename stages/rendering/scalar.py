@@ -57,7 +57,7 @@ class ScalarRenderer:
         shape = (resolution, resolution, 3)
         lights = np.zeros((len(views), count, *shape))
         direct = np.zeros((len(views), *shape))
-        sensors = [self._sensor(view, resolution) for view in views]
+        sensors = [perspective(self.record, view, resolution) for view in views]
 
         def trace(sensor, depth: int, samples: int, *where: int) -> np.ndarray:
             integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": not self.lights_visible})
@@ -98,27 +98,6 @@ class ScalarRenderer:
             self.params.update()
         return shining
 
-    def _sensor(self, view: int, resolution: int) -> mi.Sensor:
-        turn = np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba looks along +z with +x to the left
-        return mi.load_dict(
-            {
-                "type": "perspective",
-                "fov": float(self.record.fov_deg[view]),
-                "near_clip": 1e-4,
-                "far_clip": 1e4,
-                "to_world": mi.ScalarTransform4f(self.record.camera_to_world[view].astype(np.float64) @ turn),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": resolution,
-                    "height": resolution,
-                    "rfilter": {"type": "box"},
-                    "pixel_format": "rgba",
-                    "component_format": "float32",
-                },
-                "sampler": {"type": "independent"},
-            }
-        )
-
     def _first_hits(self, sensor: mi.Sensor, view: int, spp: int, seed: int) -> tuple[np.ndarray, ...]:
         """albedo, normal, depth and coverage."""
         integrator = mi.load_dict(
@@ -153,6 +132,29 @@ class ScalarRenderer:
         focal = 0.5 / np.tan(0.5 * np.radians(float(self.record.fov_deg[view])))
         x, y = np.meshgrid(centre, -centre)
         return np.stack([x, y, np.full_like(x, -focal)], axis=-1) @ self.record.camera_to_world[view, :3, :3].T
+
+
+def perspective(scene: SceneRecord, view: int, resolution: int) -> mi.Sensor:
+    """The scene's camera as a sensor of Mitsuba's, with a box filter."""
+    turn = np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba looks along +z with +x to the left
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": float(scene.fov_deg[view]),
+            "near_clip": 1e-4,
+            "far_clip": 1e4,
+            "to_world": mi.ScalarTransform4f(scene.camera_to_world[view].astype(np.float64) @ turn),
+            "film": {
+                "type": "hdrfilm",
+                "width": resolution,
+                "height": resolution,
+                "rfilter": {"type": "box"},
+                "pixel_format": "rgba",
+                "component_format": "float32",
+            },
+            "sampler": {"type": "independent"},
+        }
+    )
 
 
 def _emitter_mesh(triangles: np.ndarray, radiance: np.ndarray, content: np.ndarray) -> tuple[mi.Mesh, float]:

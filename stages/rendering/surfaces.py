@@ -160,9 +160,8 @@ def atlas_texture(picture: np.ndarray) -> Any:
     return mi.load_dict({"type": "bitmap", "data": mi.TensorXf(picture), **options})
 
 
-def shape_mesh(scene: SceneRecord) -> mi.Mesh:
+def shape_mesh(scene: SceneRecord, surfaces: Surfaces) -> mi.Mesh:
     """All triangles without a material of Mitsuba's, with texture coordinates where patches need them."""
-    surfaces = Surfaces(scene, np.arange(len(scene.triangles)))
     coordinates = surfaces.atlas.coordinates() if surfaces.varying else None
     return mesh_of(scene.triangles, scene.vertex_normals, coordinates=coordinates)
 

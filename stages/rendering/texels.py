@@ -41,6 +41,7 @@ def texel_radiance(
     covers within ``HEIGHT`` is not. It is diffuse reflectance / pi times irradiance; needs a JIT backend.
     """
     from stages.rendering.jit import JitRenderer, Limits
+    from stages.rendering.surfaces import face_normals
 
     backends.activate(backend)
     if backend["backend"] == "scalar":
@@ -48,7 +49,7 @@ def texel_radiance(
     faces = np.asarray(triangles, np.int64)
     kept, weights = texel_weights(size)
     corners = scene.triangles[faces].astype(np.float64)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = face_normals(corners)
     normals = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
     points = (weights @ corners).reshape(-1, 3)
     renderer = JitRenderer(scene, 1, seed, Limits(33), lights_visible=True)

@@ -508,8 +508,10 @@ def test_material_is_ggx_with_correlated_masking(jit):
     import mitsuba as mi
 
     from stages.rendering.material import Lobes, Material
+    from stages.rendering.surfaces import Surfaces
 
-    material = Material(clutter(), multiscatter=False)
+    scene = clutter()
+    material = Material(Surfaces(scene, np.arange(len(scene.triangles))), multiscatter=False)
     rng = np.random.default_rng(0)
     wi, wo = rng.normal(size=(2, 3, 400_000))
     wi, wo = wi / np.linalg.norm(wi, axis=0), wo / np.linalg.norm(wo, axis=0)
