@@ -112,8 +112,8 @@ def encode_view(view: ViewRecord) -> dict[str, bytes]:
 
 
 def decode_lights(data: bytes, where: str = "the view", dtype: type | None = np.float32) -> tuple[np.ndarray, dict]:
-    """(L, H, W, 3) radiance by light, and the view's meta; ``dtype`` None: half floats, as stored. In memory colours are planes,
-    as they are in the file."""
+    """(L, H, W, 3) radiance by light, and the view's meta; ``dtype`` None: half floats, as stored. In memory colours are
+    planes, as they are in the file."""
     header, channels = _decode(data, where)
     if META not in header:
         raise UserError(f"{where} has no header attribute {META!r}: it is not a view that lightmill rendered")
@@ -125,7 +125,7 @@ def decode_lights(data: bytes, where: str = "the view", dtype: type | None = np.
 
 
 def decode_layers(data: bytes, where: str = "the view", dtype: type | None = np.float32) -> dict[str, np.ndarray]:
-    """AOV layers by name: (H, W, 3) or (H, W), ``dtype`` None: half floats, as stored; indices (H, W) int32 with -1 for nothing."""
+    """AOV layers by name: (H, W, 3) or (H, W), ``dtype`` None: half floats, as stored; indices (H, W) int32, -1 for nothing."""
     _, channels = _decode(data, where)
     layers = {}
     for name, (letters, stored) in LAYERS.items():

@@ -116,35 +116,39 @@ def move(example: Batch, rotation: np.ndarray, translation: np.ndarray) -> Batch
     """The example rigidly moved; what the cameras see stays the same, but for normals, which are in world space."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    turn = rotation.astype(np.float32)
-    triangles, normals = (example[name].reshape(-1, 3) for name in ("triangles", "vertex_normals"))
+    turn = np.ascontiguousarray(rotation.T)  # of rows; BLAS likes it better than a transposed view
+    corners = example["triangles"].reshape(-1, 3) @ turn
+    for axis in range(3):  # numpy is slow where the innermost axis is short
+        corners[:, axis] += translation[axis]
     out = {
         **example,
-        "triangles": (triangles @ rotation.T + translation).astype(np.float32).reshape(-1, 3, 3),
-        "vertex_normals": (normals @ turn.T).reshape(-1, 3, 3),
+        "triangles": corners.astype(np.float32).reshape(-1, 3, 3),
+        "vertex_normals": (example["vertex_normals"].reshape(-1, 3) @ turn.astype(np.float32)).reshape(-1, 3, 3),
         "camera_to_world": (matrix @ example["camera_to_world"]).astype(np.float32),
     }
     if "normal" in out:
-        planes = np.moveaxis(out["normal"], -1, 1)
-        out["normal"] = np.moveaxis((turn @ planes.reshape(*planes.shape[:2], -1)).reshape(planes.shape), 1, -1)
+        colours = np.moveaxis(out["normal"], -1, 1)  # (V, 3, H, W)
+        turned = rotation.astype(np.float32) @ colours.reshape(*colours.shape[:2], -1)
+        out["normal"] = np.moveaxis(turned.reshape(colours.shape), 1, -1)
     return out
 
 
 def mirror(example: Batch) -> Batch:
     """The example mirrored at x = 0: corners change order to keep facing outwards, images flip left to right."""
-    flip = np.array([-1, 1, 1], np.float32)
-    flip4 = np.diag(np.array([-1, 1, 1, 1], np.float32))
+    flip = np.diag(np.array([-1, 1, 1, 1], np.float32))
     out = {
         **example,
-        "triangles": example["triangles"][:, [0, 2, 1]] * flip,
-        "vertex_normals": example["vertex_normals"][:, [0, 2, 1]] * flip,
+        "triangles": example["triangles"].take([0, 2, 1], axis=1),
+        "vertex_normals": example["vertex_normals"].take([0, 2, 1], axis=1),
         # The mirrored camera would be left-handed: turn its x axis round and the image with it.
-        "camera_to_world": flip4 @ example["camera_to_world"] @ flip4,
+        "camera_to_world": flip @ example["camera_to_world"] @ flip,
         **{name: example[name][:, :, ::-1] for name in PIXELS if name in example},
     }
     if "normal" in out:
         out["normal"] = out["normal"].copy("K")
-        out["normal"][..., 0] *= -1
+    for name in ("triangles", "vertex_normals", "normal"):
+        if name in out:
+            out[name][..., 0] *= -1
     if "patches" in out:  # texels run along corners 1 and 2, which have changed places
         out["patches"] = out["patches"].swapaxes(-1, -2)
     return out

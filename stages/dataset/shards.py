@@ -255,8 +255,8 @@ class ShardDataset:
     def read(
         self, index: int, views: Sequence[int] | None = None, layers: Sequence[str] = (), dtype: type | None = np.float32
     ) -> Sample:
-        """The sample with these views (None: all), their lights, and their AOVs if any ``layers`` are wanted; ``dtype`` None: half
-        floats, as stored."""
+        """The sample with these views (None: all), their lights, and their AOVs if any ``layers`` are wanted;
+        ``dtype`` None: half floats, as stored."""
         row = self.row(index)
         wanted = row["views"] if views is None else sorted({int(view) for view in views})
         with Reader(self, row) as reader:

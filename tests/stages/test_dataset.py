@@ -224,7 +224,9 @@ def test_only_what_is_wanted_is_decoded(artifact, monkeypatch):
     decoded = []
     for name in ("decode_lights", "decode_layers"):
         real = getattr(shards, name)
-        monkeypatch.setattr(shards, name, lambda data, where, dtype, n=name, f=real: decoded.append((n, where)) or f(data, where, dtype))
+        monkeypatch.setattr(
+            shards, name, lambda data, where, *a, n=name, f=real: decoded.append((n, where)) or f(data, where, *a)
+        )
     dataset = ShardDataset(artifact, "train", cache_mb=0)
     sample = dataset.read(1, [2])
     assert list(sample.views) == [2] and sample.views[2].normal is None
