@@ -117,7 +117,7 @@ def move(example: Batch, rotation: np.ndarray, translation: np.ndarray) -> Batch
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
     turn = np.ascontiguousarray(rotation.T)  # of rows; BLAS likes it better than a transposed view
-    corners = example["triangles"].reshape(-1, 3) @ turn
+    corners = example["triangles"].reshape(-1, 3).astype(np.float64) @ turn
     for axis in range(3):  # numpy is slow where the innermost axis is short
         corners[:, axis] += translation[axis]
     out = {

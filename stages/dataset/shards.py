@@ -228,6 +228,7 @@ class ShardDataset:
             raise UserError(f"the dataset has no {split} scenes{over}: its splits are {', '.join(sorted(splits)) or 'empty'}")
         # Lines are parsed again where needed: a tenth of the memory of parsed ones, and one block that processes share
         self._lines, self._starts = b"".join(lines), np.cumsum([0, *map(len, lines)])
+        self._parsed: tuple[int, dict[str, Any]] = -1, {}
         self.triangles, self.shard_of = np.array(triangles), np.array(shard_of)
         self._sizes = self._shard_sizes(shards)
         self.cache_bytes = int(cache_mb * 1e6)
@@ -249,8 +250,12 @@ class ShardDataset:
         return self.read(index, layers=("all",))
 
     def row(self, index: int) -> dict[str, Any]:
-        """A sample's line of the index: its views, shard, members and more."""
-        return json.loads(self._lines[self._starts[index] : self._starts[index + 1]])
+        """A sample's line of the index: its views, shard, members and more; treat as read only."""
+        number, row = self._parsed  # who asks for a row reads its sample next, which asks again
+        if number != index:
+            row = json.loads(self._lines[self._starts[index] : self._starts[index + 1]])
+            self._parsed = index, row
+        return row
 
     def read(
         self, index: int, views: Sequence[int] | None = None, layers: Sequence[str] = (), dtype: type | None = np.float32
@@ -307,7 +312,10 @@ class ShardDataset:
         return sizes
 
     def _check(self, name: str, path: Path, size: int) -> None:
-        there = path.stat().st_size if path.is_file() else None
+        try:
+            there = os.stat(path).st_size
+        except (FileNotFoundError, NotADirectoryError):
+            there = None
         if there != size:
             what = "is missing" if there is None else f"has {there:,} bytes, not {size:,}"
             raise DamagedShard(
