@@ -15,7 +15,7 @@ def denoise(
 ) -> np.ndarray:
     """(H, W, 3) float32 denoised radiance, not negative, and black where no sample of the pixel hit anything.
 
-    ``quality``: high or balanced, the denoiser's large and middle networks; the large one takes twice the time.
+    ``quality``: high or fast, the denoiser's large and small networks; the large one takes four times the time.
     """
     import pyoidn
 
