@@ -20,7 +20,7 @@ import numpy as np
 
 from stages.records import SceneRecord
 from stages.rendering.material import Lobes
-from stages.rendering.surfaces import floats
+from stages.rendering.surfaces import gatherable
 
 GRID = 8  # cells of space per axis
 CELLS = GRID**3
@@ -96,9 +96,9 @@ class Guide(Unguided):
         self._publish()
 
     def _publish(self) -> None:
-        self.shares = floats(self._shares)
-        self.cumulative = floats(np.cumsum(self._shares, axis=1, dtype=np.float64))
-        self.known = floats(np.where(self._shares.any(axis=1), SHARE, 0))
+        self.shares = gatherable(self._shares)
+        self.cumulative = gatherable(np.cumsum(self._shares, axis=1, dtype=np.float64))
+        self.known = gatherable(np.where(self._shares.any(axis=1), SHARE, 0))
 
     def learn(self, views):
         light = self.light.numpy().reshape(-1, CELLS, HEIGHTS, TURNS)

@@ -25,7 +25,7 @@ from stages.rendering.lights import SLOTS, LightTable
 from stages.rendering.material import Material
 from stages.rendering.sobol import Sampler, mixed
 from stages.rendering.sums import Sums
-from stages.rendering.surfaces import Surfaces, floats, shape_mesh
+from stages.rendering.surfaces import Surfaces, gatherable, shape_mesh
 
 BLOCKS = (8, 64)  # samples of a lane, least and most
 LANES = 1 << 15  # of a view: enough to keep processors busy, so that lanes take more samples each
@@ -73,9 +73,9 @@ class Cameras:
     """Rays of a scene's cameras through points of the pixels' filter; image row 0 is on top."""
 
     def __init__(self, scene: SceneRecord, resolution: int, filter_name: str):
-        self.pose = floats(scene.camera_to_world[:, :3].reshape(-1, 12))
-        self.focal = floats(0.5 / np.tan(0.5 * np.radians(scene.fov_deg.astype(np.float64))))  # image width 1
-        self.filter = floats(filter_offsets(filter_name))
+        self.pose = gatherable(scene.camera_to_world[:, :3].reshape(-1, 12))
+        self.focal = gatherable(0.5 / np.tan(0.5 * np.radians(scene.fov_deg.astype(np.float64))))  # image width 1
+        self.filter = gatherable(filter_offsets(filter_name))
         self.resolution = dr.opaque(mi.UInt32, resolution)
 
     def ray(self, pixel: mi.UInt32, u: mi.Point2f) -> mi.Ray3f:
@@ -105,7 +105,7 @@ class Points:
     """Rays that end at given points from ``height`` above them: (N, 3) points and unit normals on the side that is asked."""
 
     def __init__(self, points: np.ndarray, normals: np.ndarray, height: float):
-        self.origins, self.directions = floats(points + height * normals), floats(-normals)
+        self.origins, self.directions = gatherable(points + height * normals), gatherable(-normals)
 
     def ray(self, pixel: mi.UInt32, u: mi.Point2f) -> mi.Ray3f:
         return mi.Ray3f(dr.gather(mi.Point3f, self.origins, pixel), dr.gather(mi.Vector3f, self.directions, pixel))
@@ -362,11 +362,11 @@ class JitRenderer:
         def opaque(value: int) -> mi.UInt32:
             return dr.opaque(mi.UInt32, value & 0xFFFFFFFF)
 
-        ids, streams = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(stream.astype(np.uint32))
-        views = mi.UInt32((pixel // self.resolution**2).astype(np.uint32))
+        places = (pixel, stream, pixel // self.resolution**2, first, count)
+        ids, streams, views, first, count = (gatherable(values, mi.UInt32) for values in places)
         # the first two steps are one to one in the pixel: no two pixels of a stream share their numbers
         key = mixed(mixed(mixed(ids + opaque(self.seed)) + opaque(self.seed >> 32)) + streams)
-        lanes = Lanes(rays, ids, views, key, mi.UInt32(first.astype(np.uint32)), mi.UInt32(count.astype(np.uint32)))
+        lanes = Lanes(rays, ids, views, key, first, count)
         limits = self.limits
         bounds = (
             opaque(limits.bounces),
