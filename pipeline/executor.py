@@ -75,20 +75,26 @@ def run_parts(
         finally:
             close_workers()
         return
-    waiting = iter(tasks)
+    with open_pool(workers, threads) as pool:
+        run_on(pool, iter(tasks), workers, limits, on_result, log)
+
+
+@contextlib.contextmanager
+def open_pool(workers: int, threads: int) -> Iterator[ProcessPool]:
+    """Processes for parts, with ``threads`` native threads each; they end with this process."""
     with _threads(threads):
         pool = ProcessPool(max_workers=workers, initializer=die_with_parent, context=multiprocessing.get_context("spawn"))
         try:
-            _run_pool(pool, waiting, workers, limits, on_result, log)
+            yield pool
             pool.close()
-            pool.join()
         except BaseException:
             pool.stop()
-            pool.join()
             raise
+        finally:
+            pool.join()
 
 
-def _run_pool(
+def run_on(
     pool: ProcessPool,
     waiting: Iterator[PartTask],
     workers: int,
@@ -96,6 +102,7 @@ def _run_pool(
     on_result: Callable[[PartResult], None],
     log: Callable[[str], None],
 ) -> None:
+    """Run all tasks on the pool's ``workers``, at most twice as many at a time, and hold their items to the limits."""
     flying: dict[Any, PartTask] = {}
     verdicts: dict[str, tuple[str, str]] = {}  # part key -> (reason, detail) of the kill that we made ourselves
     deaths: dict[str, int] = {}  # part key -> workers that died over it

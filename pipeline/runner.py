@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import shlex
@@ -17,6 +18,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
+from pipeline.cluster import Cluster, DaskExecutor, Executor, LocalExecutor
 from pipeline.code import code_digest, commit
 from pipeline.config import Limits, Section, StageConfig, nearest, parse
 from pipeline.errors import UserError
@@ -39,6 +41,7 @@ class RunConfig(Section):
     plan: bool = False  # print the plan and stop
     workers: int | Literal["auto"] = Field("auto")  # worker processes; auto: one per core; 0: none, in this process
     debug: bool = False  # tracebacks instead of one-line errors
+    executor: Executor = LocalExecutor()  # where parts are made
 
 
 def split_config(root: Mapping[str, Any]) -> tuple[RunConfig, System, dict[str, Any]]:
@@ -48,6 +51,8 @@ def split_config(root: Mapping[str, Any]) -> tuple[RunConfig, System, dict[str, 
         if name in engine:
             value = engine[name]
             engine[name] = value.split(",") if isinstance(value, str) else value or []
+    if "executor" in engine:
+        engine["executor"] = parse(Executor, engine["executor"], "executor")
     run = parse(RunConfig, engine, "config")
     system = load_system(run.system)
     known = {*RunConfig.model_fields, *system.modules, *system.groups}
@@ -147,24 +152,25 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
         raise UserError(f"force={','.join(run.force)} needs a process of its own: run it without torchrun")
     if int(os.environ.get("RANK", "0")) > 0 and not run.plan:  # one of several processes that torchrun started
         return _follow(plan, todo, store)
-    for name, planned in plan.items():
-        artifact = artifacts[name]
-        if name in todo:
-            if run.plan:
-                out(f"{_label(system, name)} to make   key {planned.key[:12]}")
-                for line in planned.stage.estimate(planned.config, {other: plan[other].config for other in plan}):
-                    out(f"      {line}")
+    with Cluster(run.executor, out) if isinstance(run.executor, DaskExecutor) else contextlib.nullcontext() as cluster:
+        for name, planned in plan.items():
+            artifact = artifacts[name]
+            if name in todo:
+                if run.plan:
+                    out(f"{_label(system, name)} to make   key {planned.key[:12]}")
+                    for line in planned.stage.estimate(planned.config, {other: plan[other].config for other in plan}):
+                        out(f"      {line}")
+                else:
+                    inputs = {parent: artifacts[parent] for parent in planned.stage.reads(planned.config)}
+                    assert all(inputs.values())
+                    artifacts[name] = _make(run, system, planned, inputs, store, cluster, command, out)  # type: ignore[arg-type]
+            elif artifact is not None:
+                store.touch(artifact.key)
+                out(f"{_label(system, name)} up to date {_describe(artifact)}")
+                if artifact.manifest["code"]["digest"] != code_digest(system, name):
+                    out(f"   note: the code of {name} has changed since, its version has not (force={name} recomputes)")
             else:
-                inputs = {parent: artifacts[parent] for parent in planned.stage.reads(planned.config)}
-                assert all(inputs.values())
-                artifacts[name] = _make(run, system, planned, inputs, store, command, out)  # type: ignore[arg-type]
-        elif artifact is not None:
-            store.touch(artifact.key)
-            out(f"{_label(system, name)} up to date {_describe(artifact)}")
-            if artifact.manifest["code"]["digest"] != code_digest(system, name):
-                out(f"   note: the code of {name} has changed since, its version has not (force={name} recomputes)")
-        else:
-            out(f"{_label(system, name)} not needed key {planned.key[:12]}")
+                out(f"{_label(system, name)} not needed key {planned.key[:12]}")
     for name in run.stage:
         artifact = artifacts[name]
         headline = plan[name].stage.headline
@@ -222,6 +228,7 @@ def _make(
     planned: Planned,
     inputs: Mapping[str, Artifact],
     store: Store,
+    cluster: Cluster | None,
     command: Sequence[str],
     out: Callable[[str], None],
 ) -> Artifact:
@@ -245,11 +252,14 @@ def _make(
         previous = store.find(name, key)
         old_digest = previous.digest if previous else None
         environment = draft.environment()
-        environment = planned.stage.environment(planned.config, environment)
+        if cluster is not None and isinstance(planned.stage, MapStage):
+            environment = cluster.environment(run.system, name, planned.config, environment)
+        else:
+            environment = planned.stage.environment(planned.config, environment)
         draft.set_environment(environment)
         if isinstance(planned.stage, MapStage):
             products: list[str] = []
-            _run_map(run, system, planned, planned.stage, inputs, environment, store, draft, forced, out)
+            _run_map(run, system, planned, planned.stage, inputs, environment, store, cluster, draft, forced, out)
         else:
             assert isinstance(planned.stage, RunStage)
             out(f"{_label(system, name)} running    {planned.stage.slug(planned.config)}-{key[:12]}")
@@ -305,6 +315,7 @@ def _run_map(
     inputs: Mapping[str, Artifact],
     environment: dict[str, Any],
     store: Store,
+    cluster: Cluster | None,
     draft: Draft,
     forced: bool,
     out: Callable[[str], None],
@@ -357,7 +368,10 @@ def _run_map(
     workers = min(workers, len(tasks)) if workers else 0
     if tasks:
         try:
-            run_parts(tasks, workers, max(1, cores // max(workers, 1)), limits, on_result, progress.log)
+            if cluster is not None:
+                cluster.run_parts(tasks, limits, on_result, progress.log)
+            else:
+                run_parts(tasks, workers, max(1, cores // max(workers, 1)), limits, on_result, progress.log)
         finally:
             progress.close()
     if failed:

@@ -23,6 +23,7 @@ class NumbersConfig(StageConfig):
     hang: tuple[str, ...] = runtime(())
     greedy: tuple[str, ...] = runtime(())
     fail: tuple[str, ...] = runtime(())
+    log_to: str | None = runtime(None)  # a file that gets a line per computed item
 
 
 class Numbers(MapStage):
@@ -41,6 +42,9 @@ class Numbers(MapStage):
         return config
 
     def process(self, config, item):
+        if config.log_to:
+            with open(config.log_to, "a") as file:
+                file.write(item.id + "\n")
         time.sleep(config.pause_s)
         if item.id in config.crash:
             os.kill(os.getpid(), signal.SIGSEGV)
