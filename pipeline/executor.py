@@ -22,7 +22,7 @@ import psutil
 from pebble import ProcessExpired, ProcessPool
 
 from pipeline.config import Limits
-from pipeline.errors import UserError
+from pipeline.errors import MachineError
 from pipeline.worker import (
     THREADS_VARIABLE,
     PartResult,
@@ -31,6 +31,7 @@ from pipeline.worker import (
     die_with_parent,
     run_part,
     running_file,
+    write_log,
 )
 
 POLL_S = 0.25
@@ -121,7 +122,7 @@ def _run_pool(
             except ProcessExpired as death:
                 deaths[task.part_key] = deaths.get(task.part_key, 0) + 1
                 if deaths[task.part_key] > 2 * len(task.items) + MAX_UNEXPLAINED:
-                    raise UserError(
+                    raise MachineError(
                         f"{task.stage}: workers keep dying (exit code {death.exitcode}) and no item is to blame: "
                         "look at the machine's memory and at the logs; finished parts are kept"
                     ) from None
@@ -143,10 +144,12 @@ def _after_death(
         return task
     item = state["item"]
     reason, detail = verdict or ("crash", f"worker died with exit code {death.exitcode}")
+    what = f"{item}: {detail}; " + (f"rejected as {reason}" if task.first == item else "trying it once more, alone")
+    log(f"{task.stage}: {what}")
+    with contextlib.suppress(OSError):
+        write_log(task.draft, task.part_key, what)
     if task.first != item:
-        log(f"{task.stage}: {item}: {detail}; trying it once more, alone")
         return dataclasses.replace(task, first=item)
-    log(f"{task.stage}: {item}: {detail}; rejected as {reason}")
     killed = {**task.killed, item: {"reason": reason, "detail": detail, "machine": True}}
     return dataclasses.replace(task, first=None, killed=killed)
 
@@ -169,7 +172,7 @@ def _hold_to_limits(task: PartTask, limits: Limits, verdicts: dict[str, tuple[st
         memory_gb = process.memory_info().rss / 2**30
     except psutil.Error:
         return
-    wall_s = time.time() - state["time"]
+    wall_s = time.monotonic() - state["monotonic"]
     if cpu_s > limits.cpu_s:
         verdict = "time", f"over {limits.cpu_s:g} s of CPU time"
     elif wall_s > limits.wall_s:
