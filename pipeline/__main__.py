@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import hydra
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -21,7 +21,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from pipeline.errors import INTERRUPTED, UserError, status_of
+from pipeline.errors import INTERRUPTED, STORAGE_ERRORS, UserError, status_of
 from pipeline.hydra_config import CONF, compose, to_plain
 from pipeline.runner import make_plan, run_pipeline, split_config
 from pipeline.store import HashCache, Store
@@ -65,6 +65,22 @@ def interruptible() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+def guarded(work: Callable[[], None], debug: bool = False) -> int:
+    """Do the work; an error that a person can mend becomes one line and its exit status, which is returned."""
+    try:
+        with interruptible():
+            work()
+    except (ValueError, OSError) as error:
+        if debug or (isinstance(error, OSError) and error.errno not in STORAGE_ERRORS):
+            raise
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        return status_of(error)
+    except KeyboardInterrupt:
+        print("interrupted: what is finished is kept, the same command continues", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Returns the exit status: 0 done, 130 interrupted, or that of the first error (see pipeline.errors)."""
     words = list(sys.argv[1:] if words is None else words)
@@ -95,7 +111,7 @@ def main(words: Sequence[str] | None = None) -> int:
             failures.append(status_of(error))
             print(f"error: {error}", file=sys.stderr, flush=True)
 
-    try:
+    def compose_and_run() -> None:
         if not hydra_flags:
             if flags:
                 os.environ[SWEEP_VARIABLE] = json.dumps(sweep_keys(overrides))
@@ -103,19 +119,13 @@ def main(words: Sequence[str] | None = None) -> int:
                 split_config(compose(overrides))  # a bad override gets our message instead of Hydra's
         sys.argv = ["lightmill", *flags[:1], *overrides]
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-        with interruptible():
-            job()
-    except ValueError as error:
-        if debug:
-            raise
-        print(f"error: {error}", file=sys.stderr)
-        return status_of(error)
-    except KeyboardInterrupt:
-        print("interrupted: what is finished is kept, the same command continues", file=sys.stderr)
-        return INTERRUPTED
+        job()
+
+    try:
+        status = guarded(compose_and_run, debug)
     finally:
         os.environ.pop(SWEEP_VARIABLE, None)
-    return failures[0] if failures else 0
+    return status or (failures[0] if failures else 0)
 
 
 if __name__ == "__main__":

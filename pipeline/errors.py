@@ -60,4 +60,6 @@ class Reject(Exception):
 
 def status_of(error: BaseException) -> int:
     """The exit status of a command that stops with this error."""
+    if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
+        return MachineError.status
     return getattr(error, "status", UserError.status if isinstance(error, (ValueError, OSError)) else 1)

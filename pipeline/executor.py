@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import json
 import multiprocessing
 import os
@@ -15,6 +16,7 @@ import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,7 @@ from pipeline.worker import (
 )
 
 POLL_S = 0.25
+MAX_POOLS = 8  # that break as a whole
 MAX_UNEXPLAINED = 4  # deaths of a part's worker beyond what its items can explain
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -77,19 +80,53 @@ def run_parts(
             close_workers()
         return
     waiting = iter(tasks)
+    for _ in range(MAX_POOLS):
+        try:
+            with open_pool(workers, threads) as pool:
+                run_on(pool, waiting, workers, limits, on_result, log)
+            return
+        except PoolBroken as broken:
+            log("the worker processes died before they began, or while they were given work: starting new ones")
+            waiting = itertools.chain(broken.tasks, waiting)
+    raise MachineError("worker processes keep dying as they start: look at the machine's memory; finished parts are kept")
+
+
+class PoolBroken(Exception):
+    """The pool can do no more (a worker was killed at the pool's own business); ``tasks`` are still to be done."""
+
+    def __init__(self, tasks: Iterable[PartTask]):
+        super().__init__()
+        self.tasks = list(tasks)
+
+
+@contextlib.contextmanager
+def open_pool(workers: int, threads: int) -> Iterator[ProcessPool]:
+    """Processes for parts, with ``threads`` native threads each; they end with this process."""
     with _threads(threads):
         pool = ProcessPool(max_workers=workers, initializer=die_with_parent, context=multiprocessing.get_context("spawn"))
         try:
-            _run_pool(pool, waiting, workers, limits, on_result, log)
+            with _uninterrupted():
+                assert pool.active  # starts the processes and the threads that replace them
+            yield pool
             pool.close()
-            pool.join()
         except BaseException:
             pool.stop()
-            pool.join()
             raise
+        finally:
+            pool.join()
 
 
-def _run_pool(
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Threads and processes that begin in here never see Ctrl-C, not even while they import: it is the runner's business."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def run_on(
     pool: ProcessPool,
     waiting: Iterator[PartTask],
     workers: int,
@@ -103,7 +140,10 @@ def _run_pool(
     exhausted = False
 
     def submit(task: PartTask) -> None:
-        flying[pool.schedule(run_part, args=[task])] = task
+        try:
+            flying[pool.schedule(run_part, args=[task])] = task
+        except RuntimeError:
+            raise PoolBroken([task, *flying.values()]) from None
 
     while True:
         while not exhausted and len(flying) < 2 * workers:
@@ -119,6 +159,8 @@ def _run_pool(
             task = flying.pop(future)
             try:
                 on_result(future.result())
+            except BrokenProcessPool:
+                raise PoolBroken([task, *flying.values()]) from None
             except ProcessExpired as death:
                 deaths[task.part_key] = deaths.get(task.part_key, 0) + 1
                 if deaths[task.part_key] > 2 * len(task.items) + MAX_UNEXPLAINED:

@@ -106,8 +106,8 @@ def _planned(store: Store, name: str, origin: Mapping[str, Any]) -> Planned:
     planned = plan_stage(stage, config, preimage["inputs"], HashCache(store.root / ".cache" / "hashes.json"))
     if planned.key != origin["key"]:
         raise UserError(
-            f"{name} cannot be repaired part by part: the version of {stage.name} or the source files that it read have changed "
-            f"since; compute {_again(origin)}"
+            f"{name} cannot be repaired part by part: the version of {stage.name} or the source files that it read have "
+            f"changed since; compute {_again(origin)}"
         )
     return planned
 

@@ -251,7 +251,7 @@ def make_artifact(
     plan: Sequence[str] = (),
     adopt: Callable[[Draft], None] = lambda draft: None,
 ) -> Artifact:
-    """Compute one artifact and commit it. ``plan``: the stages of the whole run, for its state; ``adopt`` may fill the draft."""
+    """Compute one artifact and commit it. ``plan``: the stages of the whole run, for its state; ``adopt`` fills the draft."""
     name, key = planned.name, planned.key
     forced = name in run.force
     claim = store.claim(name, key)
