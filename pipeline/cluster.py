@@ -12,6 +12,7 @@ import contextlib
 import importlib
 import multiprocessing
 import socket
+import threading
 import time
 import uuid
 from collections.abc import Callable, Iterable
@@ -25,7 +26,7 @@ from pipeline.config import Limits, Section, StageConfig, nearest
 from pipeline.errors import UserError
 from pipeline.executor import open_pool, run_on
 from pipeline.stage import load_system
-from pipeline.worker import PartResult, PartTask
+from pipeline.worker import PartResult, PartTask, running_file
 
 # known names -> (module, class): a config chooses one of these, never an import path
 CLUSTERS = {
@@ -43,7 +44,7 @@ CONNECT = "30s"  # to the scheduler
 IN_FLIGHT = 32  # parts that the scheduler holds at least; twice its threads once there are more: it must not hold millions
 TELL_EVERY_S = 60.0  # say so while no worker is there
 VISIBLE_S = 90.0  # how long a network file system may take to show what another machine wrote
-RETRIES = 2  # of a task that raised for a reason outside the items, such as a file system that was away for a moment
+RETRIES = 2  # of a task that raised for a reason outside the items: a file system that was away, a pool that broke
 
 
 class LocalExecutor(Section):
@@ -87,12 +88,23 @@ class _Guard:
         # Dask starts its workers as daemons, which multiprocessing forbids children because they would outlive it: ours do not
         # (pipeline.worker.die_with_parent).
         multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
+        self.workers = worker.state.nthreads
+        self.lock = threading.Lock()
         self.stack = contextlib.ExitStack()
-        self.pool = self.stack.enter_context(open_pool(worker.state.nthreads, self.threads))
+        self.pool: Any = None
+
+    def working_pool(self) -> Any:
+        """The pool; a new one where the last can do no more."""
+        with self.lock:
+            if self.pool is None or not self.pool.active:
+                self.stack.close()
+                self.pool = self.stack.enter_context(open_pool(self.workers, self.threads))
+            return self.pool
 
     def teardown(self, worker: Any) -> None:
-        self.pool.stop()  # what is running now belongs to a run that has ended
-        self.stack.close()
+        if self.pool is not None:
+            self.pool.stop()  # what is running now belongs to a run that has ended
+            self.stack.close()
 
 
 @cache
@@ -103,7 +115,7 @@ def _code(system: str, stage: str) -> str:
 def _pool(guard: str) -> Any:
     from distributed import get_worker
 
-    return get_worker().plugins[guard].pool
+    return get_worker().plugins[guard].working_pool()
 
 
 def _make_part(task: PartTask, limits: Limits, code: str, guard: str) -> tuple[PartResult | UserError, list[str]]:
@@ -115,6 +127,7 @@ def _make_part(task: PartTask, limits: Limits, code: str, guard: str) -> tuple[P
         return UserError(f"{here} has other code of {task.stage}: all machines need the same, then start the workers again"), []
     results: list[PartResult] = []
     lines: list[str] = []
+    running_file(task.draft, task.part_key).unlink(missing_ok=True)  # of a lost worker, whose process numbers mean nothing here
     try:
         run_on(_pool(guard), iter([task]), 1, limits, results.append, lines.append)
     except UserError as error:
@@ -225,7 +238,7 @@ class Cluster:
                         trace = (
                             f"its part was lost with {error.last_worker.address} and others before: look at the workers' logs"
                         )
-                        result, lines = PartResult(task.part_key, 0, 0, tuple((item.id, trace) for item in task.items)), []
+                        result, lines = PartResult(task.part_key, 0, failed=tuple((item.id, trace) for item in task.items)), []
                     for line in lines:
                         log(line)
                     if isinstance(result, UserError):

@@ -6,14 +6,17 @@ import contextlib
 import os
 import platform
 import shlex
+import shutil
 import socket
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
+from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, Field
@@ -21,13 +24,23 @@ from pydantic import BaseModel, Field
 from pipeline.cluster import Cluster, DaskExecutor, Executor, LocalExecutor
 from pipeline.code import code_digest, commit
 from pipeline.config import Limits, Section, StageConfig, nearest, parse
-from pipeline.errors import UserError
+from pipeline.errors import (
+    INTERRUPTED,
+    STORAGE_ERRORS,
+    Damaged,
+    ItemsFailed,
+    MachineError,
+    TooManyRejects,
+    UserError,
+    status_of,
+)
 from pipeline.executor import run_parts
 from pipeline.keys import SCHEME, canonical, digest_of
 from pipeline.progress import Progress, duration
 from pipeline.stage import Item, MapStage, RunStage, Stage, System, load_system
-from pipeline.store import SCHEMA, Artifact, Draft, HashCache, Store
-from pipeline.worker import PartResult, PartTask, Reuse
+from pipeline.status import RunState
+from pipeline.store import DRAFT, SCHEMA, Artifact, Claim, Draft, HashCache, Store
+from pipeline.worker import PartResult, PartTask, Reuse, log_file
 
 
 class RunConfig(Section):
@@ -85,19 +98,20 @@ def make_plan(
         if name not in sections:
             raise UserError(f"the config has no section {name!r} for the stage of that name")
         config = parse(stage.Config, sections[name], name)
-        params = canonical(config, name)
-        identity = stage.identity(config, hash_file)
-        if identity:
-            params = {**params, "identity": canonical(identity, f"{name}.identity")}
-        preimage = {
-            "scheme": SCHEME,
-            "stage": name,
-            "version": stage.version,
-            "params": params,
-            "inputs": {parent: plan[parent].key for parent in stage.reads(config)},
-        }
-        plan[name] = Planned(name, stage, config, digest_of(preimage), preimage)
+        plan[name] = plan_stage(stage, config, {parent: plan[parent].key for parent in stage.reads(config)}, hash_file)
     return plan
+
+
+def plan_stage(stage: Stage, config: StageConfig, inputs: Mapping[str, str], hash_file: Callable[[Any], str]) -> Planned:
+    """The stage with this config and input keys, and with the key that they give."""
+    params = canonical(config, stage.name)
+    identity = stage.identity(config, hash_file)
+    if identity:
+        params = {**params, "identity": canonical(identity, f"{stage.name}.identity")}
+    preimage = {
+        "scheme": SCHEME, "stage": stage.name, "version": stage.version, "params": params, "inputs": dict(inputs),
+    }  # fmt: skip
+    return Planned(stage.name, stage, config, digest_of(preimage), preimage)
 
 
 def without_counts(config: BaseModel, params: Mapping[str, Any]) -> dict[str, Any]:
@@ -146,8 +160,17 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
     for name in run.force:
         if name not in plan:
             raise UserError(f"force={name}: the stage is not among those that stage={','.join(run.stage)} needs")
-    artifacts: dict[str, Artifact | None] = {name: store.find(name, planned.key) for name, planned in plan.items()}
+    artifacts: dict[str, Artifact | None] = {}
+    damaged: dict[str, Damaged] = {}
+    for name, planned in plan.items():
+        try:
+            artifacts[name] = store.find(name, planned.key)
+        except Damaged as error:
+            artifacts[name], damaged[name] = None, error
     todo = _todo(run, plan, artifacts)
+    for name, error in damaged.items():
+        if name in todo and name not in run.force:
+            raise error
     if int(os.environ.get("WORLD_SIZE", "1")) > 1 and run.force:
         raise UserError(f"force={','.join(run.force)} needs a process of its own: run it without torchrun")
     if int(os.environ.get("RANK", "0")) > 0 and not run.plan:  # one of several processes that torchrun started
@@ -163,7 +186,8 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
                 else:
                     inputs = {parent: artifacts[parent] for parent in planned.stage.reads(planned.config)}
                     assert all(inputs.values())
-                    artifacts[name] = _make(run, system, planned, inputs, store, cluster, command, out)  # type: ignore[arg-type]
+                    rest = [other for other in plan if other in todo]
+                    artifacts[name] = make_artifact(run, system, planned, inputs, store, command, out, rest, cluster)  # type: ignore[arg-type]
             elif artifact is not None:
                 store.touch(artifact.key)
                 out(f"{_label(system, name)} up to date {_describe(artifact)}")
@@ -222,35 +246,41 @@ def _describe(artifact: Artifact) -> str:
     return text
 
 
-def _make(
+def make_artifact(
     run: RunConfig,
     system: System,
     planned: Planned,
     inputs: Mapping[str, Artifact],
     store: Store,
-    cluster: Cluster | None,
     command: Sequence[str],
     out: Callable[[str], None],
+    plan: Sequence[str] = (),
+    cluster: Cluster | None = None,
+    adopt: Callable[[Draft], None] = lambda draft: None,
 ) -> Artifact:
-    """Compute one artifact and commit it."""
+    """Compute one artifact and commit it. ``plan``: the stages of the whole run, for its state; ``adopt`` fills the draft."""
     name, key = planned.name, planned.key
     forced = name in run.force
     claim = store.claim(name, key)
-    told = False
-    while (holder := claim.holder()) is not None:
-        if not told:
-            out(f"{_label(system, name)} waiting: process {holder['pid']} on {holder['host']} is making {key[:12]}")
-            told = True
-        time.sleep(1.0)
-        existing = store.find(name, key)
-        if existing is not None and not forced:
-            return existing
-    draft = store.draft(name, key, planned.preimage, out)
-    claim.take()
+    draft_path = store.draft_path(name, key)
+    state: RunState | None = None
+    began = time.monotonic()
     try:
+        made = _take(claim, store, planned, forced, lambda text: out(f"{_label(system, name)} {text}"))
+        if made is not None:
+            return made
+
+        def say(text: str) -> None:
+            if state is not None:
+                state.update(line=text)
+            out(text)
+
+        origin = {"system": run.system, "config": planned.config.model_dump(mode="json")}
+        draft = store.draft(name, key, planned.preimage, say, origin)
+        state = RunState(draft.path, command=shlex.join(command), plan=list(plan))
         started = time.time()
-        previous = store.find(name, key)
-        old_digest = previous.digest if previous else None
+        old_digest = _digest_of(store, name, key)
+        adopt(draft)
         environment = draft.environment()
         if cluster is not None and isinstance(planned.stage, MapStage):
             environment = cluster.environment(run.system, name, planned.config, environment)
@@ -259,7 +289,7 @@ def _make(
         draft.set_environment(environment)
         if isinstance(planned.stage, MapStage):
             products: list[str] = []
-            _run_map(run, system, planned, planned.stage, inputs, environment, store, cluster, draft, forced, out)
+            _run_map(run, system, planned, planned.stage, inputs, environment, store, cluster, draft, forced, out, state)
         else:
             assert isinstance(planned.stage, RunStage)
             out(f"{_label(system, name)} running    {planned.stage.slug(planned.config)}-{key[:12]}")
@@ -270,6 +300,7 @@ def _make(
             "key": key,
             "preimage": planned.preimage,
             "base_key": base_key(planned),
+            **origin,
             "code": {"digest": code_digest(system, name), **commit()},
             "environment": environment,
             "machine": machine(system.packages),
@@ -278,12 +309,28 @@ def _make(
             "command": shlex.join(command),
             "started": started,
             "finished": time.time(),
+            "seconds": time.monotonic() - began,
         }
         artifact = store.commit(draft, planned.stage.slug(planned.config), manifest, replace=forced)
-    except OSError as error:
-        if error.errno in (28, 30, 122):  # no space, read-only, quota
-            raise UserError(f"{name}: {error.strerror} at {error.filename}; finished parts are kept, run again") from None
-        raise
+    except BaseException as error:
+        if not (draft_path / DRAFT).exists() and isinstance(error, Exception) and not forced:
+            made = store.find(name, key)
+            if made is not None:  # another process took the claim from us, and was faster
+                shutil.rmtree(draft_path, ignore_errors=True)
+                out(f"{_label(system, name)} done       {_describe(made)}  by another process meanwhile")
+                return made
+        if isinstance(error, OSError) and (error.errno in STORAGE_ERRORS or str(error.filename).startswith(f"{store.root}/")):
+            where = f" ({error.filename})" if error.filename else ""
+            error = MachineError(
+                f"{name}: the store at {store.root} cannot be written: {error.strerror}{where}. Finished parts are kept: make "
+                "room or mend the disk, and run the same command again"
+            )
+        if state is not None:
+            interrupted = isinstance(error, KeyboardInterrupt)
+            state.end(
+                INTERRUPTED if interrupted else status_of(error), "interrupted" if interrupted else str(error) or repr(error)
+            )
+        raise error
     finally:
         claim.release()
     verdict = ""
@@ -291,8 +338,28 @@ def _make(
         verdict = "  equal to before" if artifact.digest == old_digest else "  DIFFERENT from before"
         if artifact.digest != old_digest:
             verdict += f" ({old_digest[:12]} is now {artifact.digest[:12]}); later stages still hold what was made from the old"
-    out(f"{_label(system, name)} done       {_describe(artifact)}  in {duration(time.time() - started)}{verdict}")
+    out(f"{_label(system, name)} done       {_describe(artifact)}  in {duration(time.monotonic() - began)}{verdict}")
     return artifact
+
+
+def _take(claim: Claim, store: Store, planned: Planned, forced: bool, say: Callable[[str], None]) -> Artifact | None:
+    """Wait for the claim. Returns the artifact if another process has made it by then."""
+    told = False
+    while not claim.take():
+        if not told and (holder := claim.holder()) is not None:
+            say(f"waiting: process {holder['pid']} on {holder['host']} is making {planned.key[:12]}")
+            told = True
+        time.sleep(0.5)
+    return None if forced else store.find(planned.name, planned.key)
+
+
+def _digest_of(store: Store, stage: str, key: str) -> str | None:
+    """The digest of the artifact that is about to be replaced, if it is there and can still say so."""
+    try:
+        previous = store.find(stage, key)
+    except Damaged:
+        return None
+    return previous.digest if previous else None
 
 
 def _parts(items: Sequence[Item], keys: Sequence[str], size: int) -> Iterator[tuple[str, list[int]]]:
@@ -319,6 +386,7 @@ def _run_map(
     draft: Draft,
     forced: bool,
     out: Callable[[str], None],
+    state: RunState,
 ) -> None:
     config = planned.config
     items = sorted(stage.items(config, inputs), key=lambda item: (item.group, item.id))
@@ -334,8 +402,9 @@ def _run_map(
         part_item_keys = tuple(keys[index] for index in indices)
         part_key = digest_of({"group": group, "items": part_item_keys})
         markers[part_key] = draft.marker(part_key)
-        if markers[part_key] is not None:
+        if markers[part_key] is not None and markers[part_key]["items"] == [item.id for item in part_items]:
             reused += len(part_items)
+            state.add_rejects(Counter(reject["reason"] for reject in markers[part_key]["rejects"]))
             continue
         reuse = {
             item.id: donors[item_key] for item, item_key in zip(part_items, part_item_keys, strict=True) if item_key in donors
@@ -352,12 +421,18 @@ def _run_map(
     label = _label(system, planned.name)
     out(f"{label} running    {total} items" + (f", {reused} of them already there" if reused else ""))
     progress = Progress(f"{label}", total, reused)
-    failed: list[tuple[str, str]] = []
+    failed: list[tuple[str, str, Path]] = []
     fresh = {task.part_key: len(task.items) - len(task.reuse) for task in tasks}
+    state.update(now=True, parts=len(markers), total=total, reused=reused, done=reused)
 
     def on_result(result: PartResult) -> None:
-        failed.extend(result.failed)
-        progress.add(fresh[result.part_key] if not result.failed else 0, result.rejects)
+        log = log_file(draft.path, result.part_key)
+        for item, trace in result.failed:
+            failed.append((item, trace, log))
+            state.add_failure(item, trace, log)
+        progress.add(fresh[result.part_key] if not result.failed else 0, sum(result.rejects.values()))
+        state.add_rejects(result.rejects)
+        state.update(now=bool(result.failed), done=progress.done)
 
     limits = parse(Limits, {**stage.limits, **config.limits}, f"{planned.name}.limits")
     workers = config.workers if config.workers is not None else run.workers
@@ -375,15 +450,17 @@ def _run_map(
         finally:
             progress.close()
     if failed:
-        (draft.logs / "failures.log").write_text("\n".join(f"{item}\n{trace}" for item, trace in failed))
-        item, trace = failed[0]
+        item, trace, log = failed[0]
         last = trace.strip().splitlines()[-1]
-        names = ", ".join(item for item, _ in failed[:8]) + (", ..." if len(failed) > 8 else "")
-        raise UserError(
-            f"{planned.name}: {len(failed)} item(s) failed: {names}. The first: {last}. "
-            f"Tracebacks: {draft.logs / 'failures.log'}. Everything else is kept; run again to continue"
+        names = ", ".join(item for item, _, _ in failed[:8]) + (", ..." if len(failed) > 8 else "")
+        raise ItemsFailed(
+            f"{planned.name}: {len(failed)} item(s) failed: {names}. The first: {last}. Its traceback: {log} "
+            "(`lightmill status` names the others'). Everything else is kept; run again to continue"
         )
-    draft.use_parts([draft.marker(part_key) for part_key in markers])  # type: ignore[misc]
+    finished = [draft.marker(part_key) for part_key in markers]
+    if not all(finished):
+        raise MachineError(f"{planned.name}: {finished.count(None)} finished part(s) vanished from {draft.path}: run again")
+    draft.use_parts(finished)  # type: ignore[arg-type]
     _check_rejects(planned, stage, draft, total)
     for path in sorted(draft.files.rglob("*"), reverse=True):  # what an interrupted finish left
         path.unlink() if path.is_file() else path.rmdir()
@@ -399,7 +476,7 @@ def _check_rejects(planned: Planned, stage: MapStage, draft: Draft, total: int) 
     if total and len(rejects) / total > planned.config.max_reject_share:
         listed = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
         first = rejects[0]
-        raise UserError(
+        raise TooManyRejects(
             f"{planned.name}: {len(rejects)} of {total} items were rejected ({listed}), more than max_reject_share="
             f"{planned.config.max_reject_share:g}. For example {first['item']}: {first['reason']}: {first['detail']}"
         )
@@ -412,6 +489,10 @@ def _donations(planned: Planned, store: Store, environment: Mapping[str, Any], w
     for artifact in store.artifacts(planned.name):
         manifest = artifact.manifest
         if manifest["base_key"] != base or manifest["environment"] != environment:
+            continue
+        try:
+            artifact.rows(), artifact.rejects()
+        except Damaged:  # it gives nothing, and is no input of ours
             continue
         rows: dict[str, list[Any]] = {}
         for row in artifact.rows():
@@ -436,8 +517,8 @@ def _link_whole(task: PartTask, store: Store, draft: Draft) -> bool:
         if part["part_key"] == task.part_key:
             rejects = [r for r in artifact.rejects() if r["item"] in set(part["items"]) and not r.get("whole")]
             rows = [row.to_json() for row in artifact.rows() if row.part == part["digest"]]
-            draft.link_part(artifact.part_path(part["digest"]), task.part_key, {**part, "rejects": rejects, "rows": rows})
-            return True
+            marker = {**part, "rejects": rejects, "rows": rows}
+            return draft.link_part(artifact.part_path(part["digest"]), task.part_key, marker)
     return False
 
 

@@ -69,6 +69,7 @@ class Numbers(MapStage):
 class SquaresConfig(StageConfig):
     offset: int = 0
     log_to: str | None = runtime(None)  # a file that gets a line per computed item
+    finish_s: float = runtime(0.0)
 
 
 class Squares(MapStage):
@@ -96,11 +97,13 @@ class Squares(MapStage):
 
     def finish(self, config, inputs, draft):
         (draft.files / "card.txt").write_text(f"{len(draft.rows())} squares\n")
+        time.sleep(config.finish_s)
         draft.note("count", len(draft.rows()))
 
 
 class TotalConfig(StageConfig):
     steps: int = 3
+    pause_s: float = runtime(0.0)
     plus_numbers: bool = added(False, legacy=False)
 
 
@@ -116,6 +119,7 @@ class Total(RunStage):
 
     def run(self, config, inputs, draft):
         squares = inputs["squares"]
+        time.sleep(config.pause_s)
         total = sum(float(squares.read(id).members["square.txt"]) for id in squares.ids())
         if config.plus_numbers:
             total += sum(float(inputs["numbers"].read(id).members["value.txt"]) for id in squares.ids())
