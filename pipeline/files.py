@@ -23,13 +23,13 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write ``data`` to a temporary name, flush it to disk, rename: readers see all of it or none."""
+def write_atomic(path: Path, data: bytes | Iterable[bytes]) -> None:
+    """Write ``data``, whole or in pieces, to a temporary name, flush it to disk, rename: readers see all of it or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
         with open(temporary, "wb") as file:
-            file.write(data)
+            file.writelines([data] if isinstance(data, bytes) else data)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -72,8 +72,15 @@ def _check(digest: Any) -> bytes:
     return f'"check": "{digest}"'.encode()
 
 
+_encode = json.JSONEncoder(sort_keys=True, ensure_ascii=False).encode
+
+
+def json_line(value: Mapping[str, Any]) -> bytes:
+    return _encode(value).encode() + b"\n"
+
+
 def write_jsonl(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    write_atomic(path, b"".join(json.dumps(row, sort_keys=True, ensure_ascii=False).encode() + b"\n" for row in rows))
+    write_atomic(path, (json_line(row) for row in rows))
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import platform
 import shlex
@@ -277,6 +278,7 @@ def make_artifact(
 
         origin = {"system": run.system, "config": planned.config.model_dump(mode="json")}
         draft = store.draft(name, key, planned.preimage, say, origin)
+        draft.sweep()
         state = RunState(draft.path, command=shlex.join(command), plan=list(plan))
         started = time.time()
         old_digest = _digest_of(store, name, key)
@@ -326,6 +328,8 @@ def make_artifact(
                 "room or mend the disk, and run the same command again"
             )
         if state is not None:
+            with contextlib.suppress(OSError):
+                draft.sweep()  # on a full disk it is room to go on with
             interrupted = isinstance(error, KeyboardInterrupt)
             state.end(
                 INTERRUPTED if interrupted else status_of(error), "interrupted" if interrupted else str(error) or repr(error)
@@ -393,18 +397,20 @@ def _run_map(
     if len({item.id for item in items}) != len(items):
         raise AssertionError(f"{planned.name} lists an item twice")
     keys = item_keys(planned, items, inputs)
-    donors = {} if forced else _donations(planned, store, environment, set(keys))
-    markers: dict[str, dict[str, Any] | None] = {}
-    tasks: list[PartTask] = []
-    total, reused = len(items), 0
+    donors = {} if forced else _donations(planned, store, environment, keys)
+    parts: dict[str, tuple[str, tuple[Item, ...], tuple[str, ...]]] = {}
     for group, indices in _parts(items, keys, stage.part_size(config, inputs)):
-        part_items = tuple(items[index] for index in indices)
         part_item_keys = tuple(keys[index] for index in indices)
         part_key = digest_of({"group": group, "items": part_item_keys})
-        markers[part_key] = draft.marker(part_key)
-        if markers[part_key] is not None and markers[part_key]["items"] == [item.id for item in part_items]:
+        parts[part_key] = group, tuple(items[index] for index in indices), part_item_keys
+    markers, damaged = draft.sound_markers(parts)
+    tasks: list[PartTask] = []
+    total, reused = len(items), 0
+    for part_key, (group, part_items, part_item_keys) in parts.items():
+        marker = markers[part_key]
+        if marker is not None and marker["items"] == [item.id for item in part_items]:
             reused += len(part_items)
-            state.add_rejects(Counter(reject["reason"] for reject in markers[part_key]["rejects"]))
+            state.add_rejects(Counter(reject["reason"] for reject in marker["rejects"]))
             continue
         reuse = {
             item.id: donors[item_key] for item, item_key in zip(part_items, part_item_keys, strict=True) if item_key in donors
@@ -417,13 +423,16 @@ def _run_map(
             )
         )  # fmt: skip
     if not forced:
-        tasks = [task for task in tasks if not _link_whole(task, store, draft)]
+        sources: dict[Path, _Source] = {}
+        tasks = [task for task in tasks if not _link_whole(task, sources, draft)]
     label = _label(system, planned.name)
+    if damaged:
+        out(f"{label} {damaged} finished part(s) of the interrupted run are damaged and made again")
     out(f"{label} running    {total} items" + (f", {reused} of them already there" if reused else ""))
     progress = Progress(f"{label}", total, reused)
     failed: list[tuple[str, str, Path]] = []
     fresh = {task.part_key: len(task.items) - len(task.reuse) for task in tasks}
-    state.update(now=True, parts=len(markers), total=total, reused=reused, done=reused)
+    state.update(now=True, parts=len(parts), total=total, reused=reused, done=reused)
 
     def on_result(result: PartResult) -> None:
         log = log_file(draft.path, result.part_key)
@@ -457,15 +466,20 @@ def _run_map(
             f"{planned.name}: {len(failed)} item(s) failed: {names}. The first: {last}. Its traceback: {log} "
             "(`lightmill status` names the others'). Everything else is kept; run again to continue"
         )
-    finished = [draft.marker(part_key) for part_key in markers]
-    if not all(finished):
-        raise MachineError(f"{planned.name}: {finished.count(None)} finished part(s) vanished from {draft.path}: run again")
-    draft.use_parts(finished)  # type: ignore[arg-type]
+    draft.use_parts(_finished(planned.name, draft, parts))
     _check_rejects(planned, stage, draft, total)
     for path in sorted(draft.files.rglob("*"), reverse=True):  # what an interrupted finish left
         path.unlink() if path.is_file() else path.rmdir()
     stage.finish(config, inputs, draft)
     stage.check(draft)
+
+
+def _finished(name: str, draft: Draft, part_keys: Iterable[str]) -> Iterator[dict[str, Any]]:
+    for part_key in part_keys:
+        marker = draft.marker(part_key)
+        if marker is None:
+            raise MachineError(f"{name}: finished part {part_key[:12]} vanished from {draft.path}: run again")
+        yield marker
 
 
 def _check_rejects(planned: Planned, stage: MapStage, draft: Draft, total: int) -> None:
@@ -482,10 +496,11 @@ def _check_rejects(planned: Planned, stage: MapStage, draft: Draft, total: int) 
         )
 
 
-def _donations(planned: Planned, store: Store, environment: Mapping[str, Any], wanted: set[str]) -> dict[str, Reuse]:
+def _donations(planned: Planned, store: Store, environment: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Reuse]:
     """Item key -> where an earlier artifact of the same stage holds that item."""
     base = base_key(planned)
     found: dict[str, Reuse] = {}
+    wanted: set[str] = set()
     for artifact in store.artifacts(planned.name):
         manifest = artifact.manifest
         if manifest["base_key"] != base or manifest["environment"] != environment:
@@ -494,32 +509,43 @@ def _donations(planned: Planned, store: Store, environment: Mapping[str, Any], w
             artifact.rows(), artifact.rejects()
         except Damaged:  # it gives nothing, and is no input of ours
             continue
-        rows: dict[str, list[Any]] = {}
-        for row in artifact.rows():
-            if row.item_key in wanted:
-                rows.setdefault(row.item_key, []).append(row)
-        found.update({key: Reuse(artifact.path, tuple(group)) for key, group in rows.items()})
+        wanted = wanted or set(keys)
+        for item_key, rows in itertools.groupby(artifact.rows(), key=lambda row: row.item_key):  # an item's rows are neighbours
+            if item_key in wanted:
+                found[item_key] = Reuse(artifact.path, tuple(row.id for row in rows))
         for reject in artifact.rejects():
             if reject.get("item_key") in wanted and not reject.get("machine"):
                 found[reject["item_key"]] = Reuse(reject=reject)
     return found
 
 
-def _link_whole(task: PartTask, store: Store, draft: Draft) -> bool:
+class _Source:
+    """An earlier artifact whose parts may be taken over whole."""
+
+    def __init__(self, path: Path):
+        self.artifact = Artifact(path)
+        self.parts = {part["part_key"]: part for part in self.artifact.manifest["outputs"]["parts"]}
+        self.rejects = {reject["item"]: reject for reject in self.artifact.rejects() if not reject.get("whole")}
+        self.spans: dict[str, list[int]] = {}  # part's digest -> its first row and the one after its last
+        for number, row in enumerate(self.artifact.rows()):
+            self.spans.setdefault(row.part, [number, number])[1] = number + 1
+
+
+def _link_whole(task: PartTask, sources: dict[Path, _Source], draft: Draft) -> bool:
     """Take over the whole part by hard link where one artifact holds exactly these items as one part."""
     if len(task.reuse) < len(task.items):
         return False
-    source = next((reuse.artifact for reuse in task.reuse.values() if reuse.artifact is not None), None)
-    if source is None:
+    path = next((reuse.artifact for reuse in task.reuse.values() if reuse.artifact is not None), None)
+    if path is None:
         return False
-    artifact = Artifact(source)
-    for part in artifact.manifest["outputs"]["parts"]:
-        if part["part_key"] == task.part_key:
-            rejects = [r for r in artifact.rejects() if r["item"] in set(part["items"]) and not r.get("whole")]
-            rows = [row.to_json() for row in artifact.rows() if row.part == part["digest"]]
-            marker = {**part, "rejects": rejects, "rows": rows}
-            return draft.link_part(artifact.part_path(part["digest"]), task.part_key, marker)
-    return False
+    source = sources.get(path) or sources.setdefault(path, _Source(path))
+    part = source.parts.get(task.part_key)
+    if part is None:
+        return False
+    first, end = source.spans[part["digest"]]
+    rows = [row.to_json() for row in source.artifact.rows()[first:end]]
+    rejects = [source.rejects[item] for item in part["items"] if item in source.rejects]
+    return draft.link_part(source.artifact.part_path(part["digest"]), task.part_key, {**part, "rejects": rejects, "rows": rows})
 
 
 @cache

@@ -23,7 +23,7 @@ import threading
 import time
 import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from pipeline.errors import Damaged, MachineError, UserError
 from pipeline.files import (
     TarWriter,
     hash_file,
+    json_line,
     read_jsonl,
     read_sealed,
     sync_folder,
@@ -43,33 +44,13 @@ from pipeline.files import (
     write_sealed,
 )
 from pipeline.keys import digest_of
+from pipeline.listing import Listing, Row
 from pipeline.stage import Record
 
 SCHEMA = 2  # of manifests; from 2 on they are sealed, so that a changed byte shows
 STALE_CLAIM_S = 120.0  # another host's claim without a heartbeat for this long is taken over
 DRAFT = "draft.json"  # what is being made; stays with the artifact
 WORKING = ("markers", "running", "state")  # folders of a draft that its artifact does not keep
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """Where one record lies: ``members`` maps a member's name to (offset, bytes) in the part's tar."""
-
-    id: str
-    item: str
-    group: str
-    part: str
-    digest: str
-    item_key: str
-    members: Mapping[str, tuple[int, int]]
-
-    def to_json(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__slots__}
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Row:
-        members = {name: (int(offset), int(size)) for name, (offset, size) in data["members"].items()}
-        return cls(data["id"], data["item"], data["group"], data["part"], data["digest"], data["item_key"], members)
 
 
 def record_digest(members: Mapping[str, bytes]) -> str:
@@ -87,19 +68,16 @@ class _Records:
 
     path: Path
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> Listing:
+        """All rows, sorted by (group, item)."""
         raise NotImplementedError
 
-    @cached_property
-    def _by_id(self) -> dict[str, Row]:
-        return {row.id: row for row in self.rows()}
-
     def __contains__(self, record_id: str) -> bool:
-        return record_id in self._by_id
+        return self.rows().holds(record_id)
 
     def row(self, record_id: str) -> Row:
         try:
-            return self._by_id[record_id]
+            return self.rows().find(record_id)
         except KeyError:
             raise UserError(f"there is no record {record_id!r} in {self.path}") from None
 
@@ -175,22 +153,21 @@ class Artifact(_Records):
     def digest(self) -> str:
         return self.manifest["outputs"]["digest"]
 
-    def _listing(self, name: str) -> list[dict[str, Any]]:
+    def _sound(self, name: str) -> Path:
         path = self.path / name
         if not path.is_file() or hash_file(path) != self.manifest["outputs"]["listings"][name]:
             raise self.damaged(f"{name} is missing or changed")
-        return read_jsonl(path)
+        return path
 
     @cached_property
-    def _rows(self) -> list[Row]:
-        return [Row.from_json(row) for row in self._listing("items.jsonl")]
+    def _rows(self) -> Listing:
+        return Listing(self._sound("items.jsonl"))
 
-    def rows(self) -> list[Row]:
-        """All rows, sorted by (group, item)."""
+    def rows(self) -> Listing:
         return self._rows
 
     def rejects(self) -> list[dict[str, Any]]:
-        return self._listing("rejects.jsonl")
+        return read_jsonl(self._sound("rejects.jsonl"))
 
     def file(self, name: str) -> Path:
         """Path of ``files/<name>``."""
@@ -353,6 +330,12 @@ class Draft(_Records):
         """Reject an item for what only the whole artifact shows (a duplicate, say). Its record stays in the parts."""
         self._whole_rejects.append({"item": item, "group": "", "reason": reason, "detail": detail, "whole": True})
 
+    def sweep(self) -> None:
+        """Delete what workers that were killed left half written. Only for who holds the claim."""
+        for pattern in ("parts/.*.tmp", "markers/.*.tmp", ".*.tmp", "running/*"):
+            for path in self.path.glob(pattern):
+                path.unlink(missing_ok=True)
+
     # -- environment: runtime choices that one artifact must not mix
 
     def environment(self) -> dict[str, Any] | None:
@@ -373,6 +356,24 @@ class Draft(_Records):
             return marker
         except (OSError, ValueError):
             return None
+
+    def sound_markers(self, part_keys: Collection[str]) -> tuple[dict[str, dict[str, Any] | None], int]:
+        """Part key -> marker (less its rows) or None, with every byte read; and how many parts turned out damaged.
+
+        What an interrupted run left may have lain for weeks; hashing runs at the disk's speed, computing again does not.
+        """
+
+        def check(part_key: str) -> tuple[dict[str, Any] | None, bool]:
+            marker = self.marker(part_key)
+            if marker is not None:
+                del marker["rows"]  # there may be millions
+            if marker is None or marker["digest"] is None or hash_file(self.part_path(marker["digest"])) == marker["digest"]:
+                return marker, False
+            return None, True
+
+        with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as threads:
+            found = dict(zip(part_keys, threads.map(check, part_keys), strict=True))
+        return {key: marker for key, (marker, _) in found.items()}, sum(damaged for _, damaged in found.values())
 
     def finish_part(self, part_key: str, marker: Mapping[str, Any]) -> None:
         write_sealed(self.path / "markers" / f"{part_key}.json", marker)
@@ -400,17 +401,27 @@ class Draft(_Records):
         return True
 
     def use_parts(self, markers: Iterable[Mapping[str, Any]]) -> None:
-        """The markers, in order, that make up the artifact: from here on rows and rejects can be read."""
-        self._markers = list(markers)
-        self._rows = [Row.from_json(row) for marker in self._markers for row in marker["rows"]]
-        self.__dict__.pop("_by_id", None)
-        seen: dict[str, str] = {}
-        for row in self._rows:
-            if row.id in seen:
-                raise UserError(f"items {seen[row.id]!r} and {row.item!r} both made a record {row.id!r}")
-            seen[row.id] = row.item
+        """The markers, in order, that make up the artifact: from here on rows and rejects can be read.
 
-    def rows(self) -> list[Row]:
+        Rows go to ``items.jsonl`` as the markers come; only what the manifest says of a part is kept in memory.
+        """
+        self._markers: list[dict[str, Any]] = []
+        makers: dict[str, str] = {}
+
+        def lines() -> Iterator[bytes]:
+            for marker in markers:
+                self._markers.append({name: value for name, value in marker.items() if name != "rows"})
+                for row in marker["rows"]:
+                    record, item = row["id"], row["item"]
+                    if record in makers:
+                        raise UserError(f"items {makers[record]!r} and {item!r} both made a record {record!r}")
+                    makers[record] = record if record == item else item  # one string of the two
+                    yield json_line(row)
+
+        write_atomic(self.path / "items.jsonl", lines())
+        self._rows = Listing(self.path / "items.jsonl")
+
+    def rows(self) -> Listing:
         return self._rows
 
     def rejects(self) -> list[dict[str, Any]]:
@@ -420,7 +431,6 @@ class Draft(_Records):
 
     def outputs(self, products: Iterable[str] = ()) -> dict[str, Any]:
         """The manifest's ``outputs``: parts, items, rejects, bytes, and the digest over records and products."""
-        write_jsonl(self.path / "items.jsonl", (row.to_json() for row in self._rows))
         rejects = self.rejects()
         write_jsonl(self.path / "rejects.jsonl", rejects)
         parts = [
@@ -573,8 +583,6 @@ class Store:
         for path in (draft.path / "parts").iterdir():
             if path.suffix != ".tar" or path.stem not in used:
                 path.unlink()  # orphans: temporaries of killed workers, parts of another plan
-        for path in draft.path.glob(".*.tmp"):
-            path.unlink()
         write_sealed(draft.path / "manifest.json", manifest)
         for folder in ("parts", "files", "."):
             sync_folder(draft.path / folder)

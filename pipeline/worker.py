@@ -20,24 +20,31 @@ import traceback
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import STORAGE_ERRORS, Damaged, Reject, UserError
 from pipeline.stage import Item, MapStage, Record, load_system
-from pipeline.store import Artifact, Draft, Row
+from pipeline.store import Artifact, Draft
 
 THREADS_VARIABLE = "LIGHTMILL_THREADS"  # what a stage may use in a worker; also set as OMP_NUM_THREADS and its like
 _opened: dict[tuple[str, str], tuple[MapStage, Any]] = {}  # (stage, key) -> the stage and its worker, once per process
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Reuse:
-    """An item taken over from an earlier artifact: its records' rows there, or its reject."""
+    """An item taken over from an earlier artifact: the ids of its records there, or its reject."""
 
     artifact: Path | None = None
-    rows: tuple[Row, ...] = ()
+    records: tuple[str, ...] = ()
     reject: Mapping[str, Any] | None = None
+
+
+@lru_cache(maxsize=4)
+def _artifact(path: Path) -> Artifact:
+    """Opened once per process: its listing may be long."""
+    return Artifact(path)
 
 
 @dataclass(frozen=True)
@@ -170,7 +177,7 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
 
     def taken_over(reuse: Reuse, item: Item) -> list[Record] | Reject:
         try:
-            return [Artifact(reuse.artifact).read(source.id) for source in reuse.rows]
+            return [_artifact(reuse.artifact).read(record) for record in reuse.records]
         except Damaged as error:  # of an artifact that this one does not depend on
             say(f"{item.id}: not taken over: {error}")
             return compute(item)
@@ -247,3 +254,4 @@ def _open(task: PartTask) -> tuple[MapStage, Any]:
 def close_workers() -> None:
     """Drop what this process opened: a run in the caller's own process leaves nothing behind."""
     _opened.clear()
+    _artifact.cache_clear()
