@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import shlex
@@ -270,6 +271,7 @@ def make_artifact(
 
         origin = {"system": run.system, "config": planned.config.model_dump(mode="json")}
         draft = store.draft(name, key, planned.preimage, say, origin)
+        draft.sweep()
         state = RunState(draft.path, command=shlex.join(command), plan=list(plan))
         started = time.time()
         old_digest = _digest_of(store, name, key)
@@ -316,6 +318,8 @@ def make_artifact(
                 "room or mend the disk, and run the same command again"
             )
         if state is not None:
+            with contextlib.suppress(OSError):
+                draft.sweep()  # on a full disk it is room to go on with
             interrupted = isinstance(error, KeyboardInterrupt)
             state.end(
                 INTERRUPTED if interrupted else status_of(error), "interrupted" if interrupted else str(error) or repr(error)
@@ -383,17 +387,19 @@ def _run_map(
         raise AssertionError(f"{planned.name} lists an item twice")
     keys = item_keys(planned, items, inputs)
     donors = {} if forced else _donations(planned, store, environment, set(keys))
-    markers: dict[str, dict[str, Any] | None] = {}
-    tasks: list[PartTask] = []
-    total, reused = len(items), 0
+    parts: dict[str, tuple[str, tuple[Item, ...], tuple[str, ...]]] = {}
     for group, indices in _parts(items, keys, stage.part_size(config, inputs)):
-        part_items = tuple(items[index] for index in indices)
         part_item_keys = tuple(keys[index] for index in indices)
         part_key = digest_of({"group": group, "items": part_item_keys})
-        markers[part_key] = draft.marker(part_key)
-        if markers[part_key] is not None and markers[part_key]["items"] == [item.id for item in part_items]:
+        parts[part_key] = group, tuple(items[index] for index in indices), part_item_keys
+    markers, damaged = draft.sound_markers(parts)
+    tasks: list[PartTask] = []
+    total, reused = len(items), 0
+    for part_key, (group, part_items, part_item_keys) in parts.items():
+        marker = markers[part_key]
+        if marker is not None and marker["items"] == [item.id for item in part_items]:
             reused += len(part_items)
-            state.add_rejects(Counter(reject["reason"] for reject in markers[part_key]["rejects"]))
+            state.add_rejects(Counter(reject["reason"] for reject in marker["rejects"]))
             continue
         reuse = {
             item.id: donors[item_key] for item, item_key in zip(part_items, part_item_keys, strict=True) if item_key in donors
@@ -408,11 +414,13 @@ def _run_map(
     if not forced:
         tasks = [task for task in tasks if not _link_whole(task, store, draft)]
     label = _label(system, planned.name)
+    if damaged:
+        out(f"{label} {damaged} finished part(s) of the interrupted run are damaged and made again")
     out(f"{label} running    {total} items" + (f", {reused} of them already there" if reused else ""))
     progress = Progress(f"{label}", total, reused)
     failed: list[tuple[str, str, Path]] = []
     fresh = {task.part_key: len(task.items) - len(task.reuse) for task in tasks}
-    state.update(now=True, parts=len(markers), total=total, reused=reused, done=reused)
+    state.update(now=True, parts=len(parts), total=total, reused=reused, done=reused)
 
     def on_result(result: PartResult) -> None:
         log = log_file(draft.path, result.part_key)
@@ -443,7 +451,7 @@ def _run_map(
             f"{planned.name}: {len(failed)} item(s) failed: {names}. The first: {last}. Its traceback: {log} "
             "(`lightmill status` names the others'). Everything else is kept; run again to continue"
         )
-    finished = [draft.marker(part_key) for part_key in markers]
+    finished = [draft.marker(part_key) for part_key in parts]
     if not all(finished):
         raise MachineError(f"{planned.name}: {finished.count(None)} finished part(s) vanished from {draft.path}: run again")
     draft.use_parts(finished)  # type: ignore[arg-type]

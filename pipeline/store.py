@@ -23,6 +23,7 @@ import threading
 import time
 import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -353,6 +354,12 @@ class Draft(_Records):
         """Reject an item for what only the whole artifact shows (a duplicate, say). Its record stays in the parts."""
         self._whole_rejects.append({"item": item, "group": "", "reason": reason, "detail": detail, "whole": True})
 
+    def sweep(self) -> None:
+        """Delete what workers that were killed left half written. Only for who holds the claim."""
+        for pattern in ("parts/.*.tmp", "markers/.*.tmp", ".*.tmp", "running/*"):
+            for path in self.path.glob(pattern):
+                path.unlink(missing_ok=True)
+
     # -- environment: runtime choices that one artifact must not mix
 
     def environment(self) -> dict[str, Any] | None:
@@ -373,6 +380,22 @@ class Draft(_Records):
             return marker
         except (OSError, ValueError):
             return None
+
+    def sound_markers(self, part_keys: Collection[str]) -> tuple[dict[str, dict[str, Any] | None], int]:
+        """Part key -> marker or None, as ``marker`` has it but with every byte read; and how many parts turned out damaged.
+
+        What an interrupted run left may have lain for weeks; hashing runs at the disk's speed, computing again does not.
+        """
+
+        def check(part_key: str) -> tuple[dict[str, Any] | None, bool]:
+            marker = self.marker(part_key)
+            if marker is None or marker["digest"] is None or hash_file(self.part_path(marker["digest"])) == marker["digest"]:
+                return marker, False
+            return None, True
+
+        with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as threads:
+            found = dict(zip(part_keys, threads.map(check, part_keys), strict=True))
+        return {key: marker for key, (marker, _) in found.items()}, sum(damaged for _, damaged in found.values())
 
     def finish_part(self, part_key: str, marker: Mapping[str, Any]) -> None:
         write_sealed(self.path / "markers" / f"{part_key}.json", marker)
@@ -573,8 +596,6 @@ class Store:
         for path in (draft.path / "parts").iterdir():
             if path.suffix != ".tar" or path.stem not in used:
                 path.unlink()  # orphans: temporaries of killed workers, parts of another plan
-        for path in draft.path.glob(".*.tmp"):
-            path.unlink()
         write_sealed(draft.path / "manifest.json", manifest)
         for folder in ("parts", "files", "."):
             sync_folder(draft.path / folder)
