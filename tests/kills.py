@@ -34,12 +34,11 @@ from pipeline.store import Store
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = (
-    "collect.per_family=1", "remesh.resolution=32", "decimate.budgets=[64,128]", "scene.count.train=8",
-    "scene.count.validation=2", "scene.count.test=2", "scene.cameras.views=2", "render.resolution=32", "render.max_spp=1",
-    "shard.shard_mb=0.1",
+    "remesh.resolution=24", "decimate.budgets=[64]", "scene.count.train=6", "scene.count.validation=2", "scene.count.test=2",
+    "scene.cameras.views=2", "render.resolution=32", "render.max_spp=1", "shard.shard_mb=0.05",
 )  # fmt: skip
 TRAIN = (
-    *DATA, "train.steps=40", "train.batch_scenes=2", "train.views_per_scene=2", "train.warmup=2", "train.ema=0.9",
+    "train.steps=40", "train.batch_scenes=2", "train.views_per_scene=2", "train.warmup=2", "train.ema=0.9",
     "train.device=cpu", "train.threads=1", "train.log_every=1", "train.validate_every=13", "train.checkpoint_every=5",
     "train.tensorboard=false", "model.latent_dim=128", "model.num_heads=1", "model.dim_feedforward=512", "model.num_layers=1",
     "model.view_transformer_latent_dim=128", "model.view_transformer_n_heads=1", "model.view_transformer_ffn_hidden_dim=512",
@@ -62,10 +61,22 @@ class Campaign:
     begun: str = " running "  # in the output: from here on there is something to lose
 
 
+def meshes(folder: Path) -> Path:
+    """Eight small meshes, enough for three splits: boxes of different proportions."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(8):
+        x, y, z = 1.0, 1.0 + 0.2 * number, 0.5 + 0.1 * number**1.5
+        corners = [f"v {x * (i & 1)} {y * (i >> 1 & 1)} {z * (i >> 2)}" for i in range(8)]
+        faces = ("1 3 4 2", "5 6 8 7", "1 2 6 5", "3 7 8 4", "1 5 7 3", "2 4 8 6")
+        (folder / f"box{number}.obj").write_text("\n".join([*corners, *(f"f {face}" for face in faces), ""]))
+    return folder
+
+
 def line(stage: str, overrides: Sequence[str], stages: tuple[str, ...], begun: str = " running ") -> Campaign:
     def command(store: Path) -> list[str]:
+        source = ["collect=folder", f"collect.path={meshes(store.parent / 'meshes')}"]
         where = [f"store={store}", f"hydra.run.dir={store}/.runs"]
-        return [sys.executable, "-m", "pipeline", f"stage={stage}", *where, *overrides]
+        return [sys.executable, "-m", "pipeline", f"stage={stage}", *where, *source, *overrides]
 
     return Campaign(command, stages, begun)
 
@@ -80,7 +91,7 @@ def synthetic(store: Path) -> list[str]:
 CAMPAIGNS = {
     "synthetic": Campaign(synthetic, ("numbers", "squares", "total")),
     "data": line("shard", DATA, ("collect", "remesh", "decimate", "scene", "render", "shard")),
-    "train": line("train", TRAIN, ("train",), "parameters ("),
+    "train": line("train", (*DATA, *TRAIN), ("train",), "parameters ("),
 }
 
 
@@ -265,7 +276,7 @@ class Striker:
             arrived = run.wait_until(lambda: time.monotonic() - began > delay)
         else:
             stage = self.random.choice(
-                [name for name in self.campaign.stages if not list(run.store.glob(f"{name}/*-*"))] or [""]
+                [name for name in self.campaign.stages if not list(run.store.glob(f"{name}/*-*"))] or ["*"]
             )
             pattern = self.random.choice(list(MOMENTS))
             number, jitter = self.random.randint(1, MOMENTS[pattern]), self.random.uniform(0, 0.004)
