@@ -58,7 +58,7 @@ def members_of(dataset: ShardDataset, index: int, views: int | None, layers: boo
 
 
 def decode(id: str, members: dict[str, bytes]) -> None:
-    """Every member as arrays, nothing more."""
+    """Every member as the arrays that ``ShardDataset`` hands out (float32, lights apart), nothing more."""
     decode_scene(id, members["scene.npz"], members["meta.json"])
     for name, data in members.items():
         if name.endswith(".aov.exr"):
@@ -112,7 +112,13 @@ def bytes_and_speed(dataset: ShardDataset, count: int, folder: Path, what: set[s
         fresh = ShardDataset(dataset.source.root, dataset.split, cache_mb=0)
         batches = Batches(fresh, config)
         steps = n // config.batch_scenes
-        rates[label] = steps * config.batch_scenes / cpu(lambda b=batches, s=steps: [b(step) for step in range(s)])
+
+        def load(batches: Batches = batches, steps: int = steps) -> None:
+            for step in range(steps):
+                batches(step)  # and let go, as training does
+
+        batches(steps)  # imports and the epoch's order are paid once
+        rates[label] = steps * config.batch_scenes / cpu(load)
         parts = [members_of(dataset, index, views, bool(layers)) for index in indices]
         alone = n / cpu(lambda p=parts: [decode(dataset.ids[i], m) for i, m in zip(indices, p, strict=True)])
         note = f"{rates[label] / released:.1f} x HDF5, {rates[label] / alone:.0%} of decoding alone ({alone:,.1f})"

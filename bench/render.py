@@ -66,6 +66,7 @@ from stages.s04_render import Render
 ROOT = Path(__file__).resolve().parents[1]
 MAX_DEPTH = 34  # segments; Cycles: 32 bounces
 CHUNK = 256  # samples per pixel in one call for a truth
+GUIDED = 1e-9  # target error out of reach: a truth is made with path guiding
 RATE_SPP = 64  # samples per pixel of the renders that measure samples per second
 FIXED = (64, 4096)
 MADE = [  # overrides of the default scenes
@@ -262,7 +263,7 @@ class Bench:
             total = [np.zeros(1)] * len(layers)
             for first in range(0, half, CHUNK):
                 share = min(CHUNK, half - first)
-                record = self.render(view, f"truth/{name}/{first}", share, denoise=False)[1]
+                record = self.render(view, f"truth/{name}/{first}", share, denoise=False, target_error=GUIDED)[1]
                 weighted = [getattr(record, layer).astype(np.float64) * (share / half) for layer in layers]
                 total = [a + b for a, b in zip(total, weighted, strict=True)]
             sums.append(total)

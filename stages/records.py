@@ -197,7 +197,8 @@ class ViewRecord:
     triangle, object: (H, W) int32, what the pixel's first sample hit: row of ``SceneRecord.triangles`` and its
         ``object_index``; -1 for nothing.
     meta: JSON. ``index`` (camera), ``status`` ok|dark|too_close, ``mean``, ``nearest``, ``spp``, ``error`` (estimated, see
-        ``stages.rendering.error``), ``denoiser`` balanced|high|null, ``clamped`` half-floats.
+        ``stages.rendering.error``), ``dropped`` (samples from before guiding that are not in it), ``denoiser`` fast|high|null,
+        ``clamped`` half-floats.
     """
 
     lights: np.ndarray

@@ -51,7 +51,7 @@ class RenderWorker:
 
 class Render(MapStage):
     name = "render"
-    version = 4
+    version = 5
     inputs = ("scene",)
     Config = RenderConfig
     reasons = {

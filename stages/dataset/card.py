@@ -178,12 +178,13 @@ def plot_distributions(drawn: Mapping[str, Mapping[str, np.ndarray]], path: Path
             axes.set(xticks=[], yticks=[])
             continue
         low, high = every.min(), every.max()
-        if scale == "integer":
+        if high - low <= 1e-6 * abs(high):  # constant: one bar over the value
+            scale = "constant"
+            edges = low + np.array([-0.5, 0.5]) * (abs(low) or 1.0)
+        elif scale == "integer":
             edges = np.arange(np.floor(low), np.floor(high) + 2) - 0.5
         elif scale == "log2":
             edges = 2.0 ** (np.arange(np.floor(np.log2(low)), np.floor(np.log2(high)) + 2) - 0.5)
-        elif high <= low * (1 + 1e-6) or high == low:
-            edges = np.array([low * 0.9 - 1e-3, high * 1.1 + 1e-3])
         else:
             bins = int(np.clip(2 * len(every) ** 0.5, 8, 40))
             edges = (np.geomspace if scale == "log" else np.linspace)(low, high, bins + 1)
@@ -202,6 +203,9 @@ def plot_distributions(drawn: Mapping[str, Mapping[str, np.ndarray]], path: Path
             ticks = ticks[:: -(-len(ticks) // 6)]
             axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
             axes.minorticks_off()
+        if scale == "constant":
+            axes.set_xticks([low], [f"{low:.4g}"])
+            axes.set_xlim(*(edges + np.diff(edges) * [-1, 1]))
         axes.set_ylabel("share")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)

@@ -87,8 +87,8 @@ class Batches:
         share = self.config.batch_scenes // self.world
         first = step * self.config.batch_scenes + self.rank * share
         damaged: dict[str, str] = {}
-        examples = [self._example(position, damaged) for position in range(first, first + share)]
-        return collate(examples, self.config.pad_multiple) | {"damaged": sorted(damaged.items())}
+        examples = (self._example(position, damaged) for position in range(first, first + share))
+        return collate(examples, share, self.config.pad_multiple) | {"damaged": sorted(damaged.items())}
 
     def order(self, epoch: int) -> np.ndarray:
         """(len(dataset),) indices in the order of that epoch: each exactly once.
@@ -158,7 +158,7 @@ class Batches:
         rng = np.random.default_rng(seed_for(config.seed, "augment", f"{epoch}/{row['id']}"))
         kept, wanted = np.array(row["views"]), config.views_per_scene
         views = rng.choice(kept, size=wanted, replace=wanted > len(kept))
-        sample = self.dataset.read(index, views, config.layers)
+        sample = self.dataset.read(index, views, config.layers, None)
         factors = draw_light_factors(config.lighting, rng, sample.scene.n_lights) if config.relight else None
         example = make_example(sample, views, factors, config.layers)
         if config.mirror and rng.random() < 0.5:
@@ -175,7 +175,7 @@ def evaluation_samples(dataset: ShardDataset) -> Iterator[Batch]:
     """One scene at a time with all its kept views, exactly as stored, and the direct light beside it."""
     for index in range(len(dataset)):
         sample = dataset.read(index, layers=("direct",))
-        yield collate([make_example(sample, np.array(sorted(sample.views)), None, ("direct",))])
+        yield collate([make_example(sample, np.array(sorted(sample.views)), None, ("direct",))], 1)
 
 
 # --- workers ----------------------------------------------------------------------------------------------------------

@@ -228,10 +228,11 @@ class ShardDataset:
             raise UserError(f"the dataset has no {split} scenes{over}: its splits are {', '.join(sorted(splits)) or 'empty'}")
         # Lines are parsed again where needed: a tenth of the memory of parsed ones, and one block that processes share
         self._lines, self._starts = b"".join(lines), np.cumsum([0, *map(len, lines)])
+        self._parsed: tuple[int, dict[str, Any]] = -1, {}
         self.triangles, self.shard_of = np.array(triangles), np.array(shard_of)
         self._sizes = self._shard_sizes(shards)
         self.cache_bytes = int(cache_mb * 1e6)
-        self._cache: OrderedDict[tuple[int, str], tuple[Any, int]] = OrderedDict()
+        self._cache: OrderedDict[tuple, tuple[Any, int]] = OrderedDict()
         self._used, self._lock = 0, threading.Lock()
 
     def __len__(self) -> int:
@@ -249,11 +250,18 @@ class ShardDataset:
         return self.read(index, layers=("all",))
 
     def row(self, index: int) -> dict[str, Any]:
-        """A sample's line of the index: its views, shard, members and more."""
-        return json.loads(self._lines[self._starts[index] : self._starts[index + 1]])
+        """A sample's line of the index: its views, shard, members and more; treat as read only."""
+        number, row = self._parsed  # who asks for a row reads its sample next, which asks again
+        if number != index:
+            row = json.loads(self._lines[self._starts[index] : self._starts[index + 1]])
+            self._parsed = index, row
+        return row
 
-    def read(self, index: int, views: Sequence[int] | None = None, layers: Sequence[str] = ()) -> Sample:
-        """The sample with these views (None: all), their lights, and their AOVs if any ``layers`` are wanted."""
+    def read(
+        self, index: int, views: Sequence[int] | None = None, layers: Sequence[str] = (), dtype: type | None = np.float32
+    ) -> Sample:
+        """The sample with these views (None: all), their lights, and their AOVs if any ``layers`` are wanted;
+        ``dtype`` None: half floats, as stored."""
         row = self.row(index)
         wanted = row["views"] if views is None else sorted({int(view) for view in views})
         with Reader(self, row) as reader:
@@ -262,14 +270,14 @@ class ShardDataset:
             for view in wanted:
                 image, aov = view_members(view)
                 where = f"{image} of {row['id']}"
-                lights, meta = self._cached((index, image), lambda n=image, w=where: decode_lights(reader[n], w))
+                lights, meta = self._cached((index, image, dtype), lambda n=image, w=where: decode_lights(reader[n], w, dtype))
                 found = {}
                 if layers:
-                    found = self._cached((index, aov), lambda n=aov, w=where: decode_layers(reader[n], w))
+                    found = self._cached((index, aov, dtype), lambda n=aov, w=where: decode_layers(reader[n], w, dtype))
                 out[view] = _view(lights, meta, found)
         return Sample(scene, out)
 
-    def _cached(self, key: tuple[int, str], decode: Any) -> Any:
+    def _cached(self, key: tuple, decode: Any) -> Any:
         with self._lock:
             if key in self._cache:
                 self._cache.move_to_end(key)
@@ -304,7 +312,10 @@ class ShardDataset:
         return sizes
 
     def _check(self, name: str, path: Path, size: int) -> None:
-        there = path.stat().st_size if path.is_file() else None
+        try:
+            there = os.stat(path).st_size
+        except (FileNotFoundError, NotADirectoryError):
+            there = None
         if there != size:
             what = "is missing" if there is None else f"has {there:,} bytes, not {size:,}"
             raise DamagedShard(

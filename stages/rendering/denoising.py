@@ -7,6 +7,10 @@ aliasing, and the denoiser then keeps every edge that they show. Measured in doc
 
 from __future__ import annotations
 
+import functools
+import sys
+from types import ModuleType
+
 import numpy as np
 
 
@@ -15,13 +19,11 @@ def denoise(
 ) -> np.ndarray:
     """(H, W, 3) float32 denoised radiance, not negative, and black where no sample of the pixel hit anything.
 
-    ``quality``: high or balanced, the denoiser's large and middle networks; the large one takes twice the time.
+    ``quality``: high or fast, the denoiser's large and small networks; the large one takes four times the time.
     """
-    import pyoidn
-
     if not radiance.any():
         return radiance
-    clean = pyoidn.denoise(
+    clean = _pyoidn().denoise(
         np.ascontiguousarray(radiance, np.float32),
         np.ascontiguousarray(np.clip(albedo, 0, 1), np.float32),
         np.ascontiguousarray(normal, np.float32),
@@ -30,3 +32,17 @@ def denoise(
         quality=quality,
     )
     return np.where(coverage[..., None] > 0, np.maximum(clean, 0), 0).astype(np.float32)
+
+
+@functools.cache
+def _pyoidn() -> ModuleType:
+    """The library, kept from importing torch: a second at every worker's start and 200 MB, for tensors that are not used."""
+    hidden = "torch" not in sys.modules
+    if hidden:
+        sys.modules["torch"] = None
+    try:
+        import pyoidn
+    finally:
+        if hidden:
+            del sys.modules["torch"]
+    return pyoidn

@@ -20,11 +20,12 @@ import mitsuba as mi
 import numpy as np
 
 from stages.records import SceneRecord
+from stages.rendering.guiding import Guide, Trail, Unguided
 from stages.rendering.lights import SLOTS, LightTable
 from stages.rendering.material import Material
 from stages.rendering.sobol import Sampler, mixed
 from stages.rendering.sums import Sums
-from stages.rendering.surfaces import Surfaces, floats, shape_mesh
+from stages.rendering.surfaces import Surfaces, gatherable, shape_mesh
 
 BLOCKS = (8, 64)  # samples of a lane, least and most
 LANES = 1 << 15  # of a view: enough to keep processors busy, so that lanes take more samples each
@@ -35,6 +36,7 @@ FILTER_CELLS = 1024
 BLACKMAN_HARRIS_SPAN = 3.0  # pixels from end to end: what Blender calls a width of 1.5
 # Dimensions of a bounce for the sampler; camera rays come before the first bounce.
 LIGHT_AND_LOBE, LIGHT_POINT, DIRECTION, ROULETTE, DIMENSIONS = range(5)
+GUIDE = 1 << 16  # behind those of all bounces: guided or not, the others stay as they are
 FILM = 0xFFFFFFFF
 
 
@@ -71,9 +73,9 @@ class Cameras:
     """Rays of a scene's cameras through points of the pixels' filter; image row 0 is on top."""
 
     def __init__(self, scene: SceneRecord, resolution: int, filter_name: str):
-        self.pose = floats(scene.camera_to_world[:, :3].reshape(-1, 12))
-        self.focal = floats(0.5 / np.tan(0.5 * np.radians(scene.fov_deg.astype(np.float64))))  # image width 1
-        self.filter = floats(filter_offsets(filter_name))
+        self.pose = gatherable(scene.camera_to_world[:, :3].reshape(-1, 12))
+        self.focal = gatherable(0.5 / np.tan(0.5 * np.radians(scene.fov_deg.astype(np.float64))))  # image width 1
+        self.filter = gatherable(filter_offsets(filter_name))
         self.resolution = dr.opaque(mi.UInt32, resolution)
 
     def ray(self, pixel: mi.UInt32, u: mi.Point2f) -> mi.Ray3f:
@@ -103,7 +105,7 @@ class Points:
     """Rays that end at given points from ``height`` above them: (N, 3) points and unit normals on the side that is asked."""
 
     def __init__(self, points: np.ndarray, normals: np.ndarray, height: float):
-        self.origins, self.directions = floats(points + height * normals), floats(-normals)
+        self.origins, self.directions = gatherable(points + height * normals), gatherable(-normals)
 
     def ray(self, pixel: mi.UInt32, u: mi.Point2f) -> mi.Ray3f:
         return mi.Ray3f(dr.gather(mi.Point3f, self.origins, pixel), dr.gather(mi.Vector3f, self.directions, pixel))
@@ -115,6 +117,7 @@ class Lanes:
 
     start: Cameras | Points
     pixel: mi.UInt32
+    view: mi.UInt32
     key: mi.UInt32  # of the random numbers
     first: mi.UInt32  # number of the first sample
     count: mi.UInt32  # samples
@@ -125,12 +128,12 @@ def _add(slots: list, slot: mi.Int32, value: mi.Color3f) -> list:
 
 
 @dr.syntax
-def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start):
+def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start, guide):
     """Sums over the samples of each lane: (light slots, direct, albedo, normal, distance, hits, nearest distance, triangle).
 
     ``limits``: opaque (bounces, diffuse bounces, glossy bounces, indirect clamp on the sum over RGB). ``hide``: opaque
     bool, camera rays pass through lights. The triangle is that of the first sample, -1 where it hit nothing.
-    ``diffuse_start``: the first surface is a white diffuse one, whatever its material.
+    ``diffuse_start``: the first surface is a white diffuse one, whatever its material. ``guide`` learns, and picks directions.
     """
     max_bounces, max_diffuse, max_glossy, clamp = limits
     slots = [mi.Color3f(0) for _ in range(SLOTS)]
@@ -144,6 +147,7 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
     fresh = mi.Bool(True)
     throughput, bsdf_pdf, widest = mi.Color3f(1), mi.Float(0), mi.Float(dr.inf)  # widest: least density so far
     bounce, diffuse, glossy = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+    trail = Trail.none()
 
     while done < lanes.count:
         number = lanes.first + done
@@ -181,6 +185,7 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         value = dr.select(hit, clamped(value, dr.select(bounce > 1, clamp, dr.inf)), 0)
         slots = _add(slots, slot, value)
         direct += dr.select(bounce <= 1, value, 0)
+        guide.add(trail, value, hit & trail.further)
 
         # Next-event estimation at surfaces; lights reflect nothing.
         surface = found & ~on_light & (bounce < max_bounces) & (diffuse <= max_diffuse) & (glossy <= max_glossy)
@@ -190,6 +195,7 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         if diffuse_start:
             white = bounce == 0
             lobes.diffuse, lobes.specular = dr.select(white, 1, lobes.diffuse), dr.select(white, 0, lobes.specular)
+        spot = guide.at(lanes.view, si, lobes, surface)
         choice = sampler.two(dimension + LIGHT_AND_LOBE)
         lit, point = lights.sample(choice.x, sampler.two(dimension + LIGHT_POINT))
         shadow = si.spawn_ray_to(point)
@@ -203,14 +209,20 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         sampled &= dr.max(reflected) > 0
         sampled &= ~scene.ray_test(shadow, sampled)
         light_pdf = density * distance2 / dr.maximum(cosine, 1e-9)
+        pdf = guide.density(pdf, spot, to_light)
         value = throughput * reflected * dr.gather(mi.Color3f, lights.emission, lit) * (mis_weight(light_pdf, pdf) / light_pdf)
         value = dr.select(sampled, clamped(value, dr.select(bounce > 0, clamp, dr.inf)), 0)
         slots = _add(slots, dr.gather(mi.Int32, lights.slot, lit), value)
         direct += dr.select(bounce == 0, value, 0)
+        guide.add(trail, value, sampled)
 
-        # The next direction, from the material.
-        wo, is_glossy = material.sample(lobes, si.wi, choice.y, sampler.two(dimension + DIRECTION))
+        # The next direction, from the material or from what was learned.
+        within = sampler.two(dimension + DIRECTION)
+        wo, is_glossy = material.sample(lobes, si.wi, choice.y, within)
+        wo = guide.direction(wo, spot, si, sampler.two(dimension + GUIDE), within)
         scattered, pdf = material.evaluate(lobes, si.wi, wo)
+        direction, arriving = si.to_world(wo), mi.Color3f(throughput)
+        pdf = guide.density(pdf, spot, direction)
         glossy += dr.select(surface & is_glossy, 1, 0)
         diffuse += dr.select(surface & ~is_glossy, 1, 0)
         bounce += dr.select(surface, 1, 0)
@@ -221,13 +233,14 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         survival = dr.select(bounce >= RR_DEPTH, dr.minimum(brightest, 0.95), 1)
         lives = surface & (brightest > 0) & (sampler.one(dimension + ROULETTE) < survival)
         throughput = dr.select(lives, throughput / survival, throughput)
-        ray = dr.select(through, si.spawn_ray(ray.d), si.spawn_ray(si.to_world(wo)))
+        ray = dr.select(through, si.spawn_ray(ray.d), si.spawn_ray(direction))
 
         # The path goes on, or the lane's next sample begins.
         fresh = ~(lives | through)
         done += dr.select(fresh, 1, 0)
         throughput, bsdf_pdf = dr.select(fresh, 1, throughput), dr.select(fresh, 0, bsdf_pdf)
         widest = dr.select(fresh, dr.inf, widest)
+        trail = guide.step(trail, spot, direction, arriving, fresh)
         bounce, diffuse, glossy = [dr.select(fresh, 0, count) for count in (bounce, diffuse, glossy)]
 
     return slots, direct, albedos, normals, distances, hits, nearest, triangle
@@ -248,14 +261,23 @@ def clamped(value, limit):
 class JitRenderer:
     """One scene, ready to be seen from its cameras."""
 
-    def __init__(self, scene: SceneRecord, resolution: int, seed: int, limits: Limits, lights_visible: bool):
+    def __init__(
+        self, scene: SceneRecord, resolution: int, seed: int, limits: Limits, lights_visible: bool, guided: bool = False
+    ):
         self.record, self.resolution, self.seed = scene, resolution, seed
         self.limits, self.lights_visible = limits, lights_visible
         surfaces = Surfaces(scene, np.arange(len(scene.triangles)))
         self.scene = mi.load_dict({"type": "scene", "surface": shape_mesh(scene, surfaces)})
         self.material = Material(surfaces, limits.multiscatter)
         self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
+        self.guided = guided
+        self.guides = [Guide(scene) if guided else Unguided() for _ in self.passes]
         self.cameras = Cameras(scene, resolution, limits.filter)
+
+    def learn(self, views: list[int]) -> None:
+        """Guide the paths of these views from now on by what those so far have brought."""
+        for guide in self.guides:
+            guide.learn(views)
 
     def texel_sums(self, points: np.ndarray, normals: np.ndarray, height: float, spp: int) -> dict[str, np.ndarray]:
         """Light that arrives at (N, 3) points, as seen from their normals' side on white diffuse material.
@@ -340,10 +362,11 @@ class JitRenderer:
         def opaque(value: int) -> mi.UInt32:
             return dr.opaque(mi.UInt32, value & 0xFFFFFFFF)
 
-        ids, streams = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(stream.astype(np.uint32))
+        places = (pixel, stream, pixel // self.resolution**2, first, count)
+        ids, streams, views, first, count = (gatherable(values, mi.UInt32) for values in places)
         # the first two steps are one to one in the pixel: no two pixels of a stream share their numbers
         key = mixed(mixed(mixed(ids + opaque(self.seed)) + opaque(self.seed >> 32)) + streams)
-        lanes = Lanes(rays, ids, key, mi.UInt32(first.astype(np.uint32)), mi.UInt32(count.astype(np.uint32)))
+        lanes = Lanes(rays, ids, views, key, first, count)
         limits = self.limits
         bounds = (
             opaque(limits.bounces),
@@ -354,7 +377,8 @@ class JitRenderer:
         hide = dr.opaque(mi.Bool, not self.lights_visible)
         pass_key = opaque(number * 0x5851F42D)
         white = isinstance(rays, Points)
-        out = trace_paths(self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white)
+        guide = Unguided() if white else self.guides[number]
+        out = trace_paths(self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, guide)
         dr.eval(out)
         slots, *wide, distances, hits, nearest, triangle = out
         size = len(pixel)

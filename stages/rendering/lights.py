@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from stages.records import SceneRecord
-from stages.rendering.surfaces import face_normals, floats
+from stages.rendering.surfaces import face_normals, gatherable
 
 SLOTS = 8  # lights per pass; more lights take several passes of the same kernel
 OTHER = SLOTS  # slot of a light that belongs to another pass: hidden like any light, black here
@@ -47,15 +47,15 @@ class LightTable:
         density[chosen] = power[chosen] / power[chosen].sum() / np.maximum(0.5 * length[chosen], 1e-30)
 
         self.slots = min(max(scene.n_lights - first, 1), SLOTS)  # in use, one at least
-        self.slot = mi.Int32(slot.astype(np.int32))
-        self.emission = floats(emission)
-        self.density = floats(density)
-        self.normal = floats(cross / np.maximum(length, 1e-30)[:, None])
-        self.vertices = floats(scene.triangles)
+        self.slot = gatherable(slot, mi.Int32)
+        self.emission = gatherable(emission)
+        self.density = gatherable(density)
+        self.normal = gatherable(cross / np.maximum(length, 1e-30)[:, None])
+        self.vertices = gatherable(scene.triangles)
         self.count = dr.opaque(mi.UInt32, len(chosen))
-        self.triangle = mi.UInt32(chosen.astype(np.uint32))
-        self.threshold = floats(threshold)
-        self.alias = mi.UInt32(alias.astype(np.uint32))
+        self.triangle = gatherable(chosen, mi.UInt32)
+        self.threshold = gatherable(threshold)
+        self.alias = gatherable(alias, mi.UInt32)
 
     def sample(self, pick: mi.Float, spot: mi.Point2f) -> tuple[mi.UInt32, mi.Point3f]:
         """A light triangle by power, and a point spread evenly over it, from numbers in [0, 1)."""

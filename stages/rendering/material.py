@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from stages.rendering.surfaces import MIN_ALPHA, Surfaces, atlas_texture, floats
+from stages.rendering.surfaces import MIN_ALPHA, Surfaces, atlas_texture, gatherable
 
 CELLS = 32  # of the tables of directional albedo, per axis
 
@@ -69,9 +69,9 @@ class Material:
     def __init__(self, surfaces: Surfaces, multiscatter: bool):
         self._pictures = {name: atlas_texture(surfaces.picture(name)) for name in sorted(surfaces.varying - {"albedo"})}
         self._values = {
-            name: floats(surfaces.values[name]) for name in ("diffuse", "specular", "alpha") if name not in self._pictures
+            name: gatherable(surfaces.values[name]) for name in ("diffuse", "specular", "alpha") if name not in self._pictures
         }
-        self._albedo = [floats(table) for table in directional_albedo()] if multiscatter else None
+        self._albedo = [gatherable(table) for table in directional_albedo()] if multiscatter else None
 
     def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Lobes:
         diffuse, specular = (

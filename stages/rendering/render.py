@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,11 +22,12 @@ from stages.exr import clamped_values
 from stages.records import SceneRecord, ViewRecord
 from stages.rendering import backend as backends
 from stages.rendering.denoising import denoise as denoise_layer
-from stages.rendering.error import QUALITIES, estimated_error
+from stages.rendering.error import cheapest, raw_error
 from stages.rendering.sums import Sums
 
 MODES = ("physical", "cycles")
 FIRST_SPP = 16  # before the first estimate
+FAR = 2.0  # times the target: a view whose first estimate is beyond loses its first samples, taken without guiding
 MIN_MEAN = 0.01  # mean radiance under which a view is dark
 MIN_DEPTH = 0.01  # nearest distance, scene units, under which a view is too close
 
@@ -51,49 +52,51 @@ def render_views(
     max_spp: camera paths per pixel for the image with all lights on, at most. The JIT integrator shares each path among all
         lights; the scalar one gives each light its share of the paths.
     target_error: a view gets 16 samples, then 32, 48, 64, 96, 128, 192 .. until its estimated error
-        (``stages.rendering.error``) is at most this; 0: ``max_spp`` at once, and no estimate.
+        (``stages.rendering.error``) is at most this, from the second portion on guided by what the first has found
+        (``stages.rendering.guiding``); 0: ``max_spp`` at once, no guiding, and no estimate.
     backend: from ``stages.rendering.backend.choose``. max_depth: longest path in segments; 2 is direct light only.
     lights_visible: whether camera rays see lights (reflections always do).
     """
     if mode not in MODES:
         raise UserError(f"mode={mode!r} is unknown: choose from {', '.join(MODES)}")
     backends.activate(backend, threads)
-    sample = _sampler(scene, resolution, seed, backend, mode, max_depth, lights_visible)
+    renderer = _renderer(scene, resolution, seed, backend, mode, max_depth, lights_visible, target_error > 0)
     records = {}
     active = list(range(len(scene.camera_to_world))) if views is None else list(views)
-    order, halves, taken = list(active), {}, 0
+    order, taken = list(active), 0
     # With a target, two streams that share no path: what tells noise from image.
     streams = [0, 1] if target_error > 0 and max_spp > 1 else [0]
     total = max_spp // len(streams)  # of each stream
     step = min(FIRST_SPP // 2, total) if len(streams) > 1 else total
-    due = dict.fromkeys(active, 0)  # samples before which an estimate is not worth its cost
+    parts: dict[int, list[Sums]] = {view: [] for view in active}  # per stream
+    due = dict.fromkeys(active, 0.0)  # samples of a stream before which an estimate is not worth its cost
     while active:
-        for stream, found in enumerate(sample(active, streams, taken, step)):
-            for view, sums in zip(active, found, strict=True):
-                before = halves.setdefault(view, {})
-                before[stream] = before[stream] + sums if stream in before else sums
+        if taken:
+            renderer.learn(active)
+        sampled = renderer.sample(active, streams, taken, step)
         taken += step
         left = []
-        for view in active:
+        for view, new in zip(active, zip(*sampled, strict=True), strict=True):
+            mine = parts[view] = (
+                [before + more for before, more in zip(parts[view], new, strict=True)] if parts[view] else list(new)
+            )
             if 1.5 * taken <= due[view] and taken < total:  # even the next count would not do
                 left.append(view)
                 continue
-            parts = list(halves[view].values())
-            sums = functools.reduce(operator.add, parts)
-            seen = sums.view(scene.object_index)
-            quality, error = "high", None
-            if len(parts) > 1:
-                estimate = estimated_error(*(part.view(scene.object_index) for part in parts), seen, denoise)
-                # the cheaper network where it meets the target, the better one where it does not
-                qualities = QUALITIES if denoise else {"high": 1.0}
-                quality = next((name for name, factor in qualities.items() if estimate * factor <= target_error), "high")
-                error = estimate * qualities[quality]
-            if taken < total and error is not None and error > target_error:
-                due[view] = taken * (error / target_error) ** 2  # no error falls faster than by the square root
-                left.append(view)
-            else:
-                del halves[view]
-                records[view] = _finish(seen, sums, view, quality if denoise else None, error)
+            sums = functools.reduce(operator.add, mine)
+            whole, *halves = (part.view(scene.object_index) for part in (sums, *mine))
+            quality, error = "high" if denoise else None, None
+            if len(halves) > 1:
+                quality, error = cheapest(*halves, whole, target_error) if denoise else (None, raw_error(*halves))
+            if taken == total or error is None or error <= target_error:
+                records[view] = _finish(whole, sums, view, quality, error, len(streams) * taken - sums.spp)
+                del parts[view]
+                continue
+            left.append(view)
+            if renderer.guided and taken == step and total >= 2 * taken and error > FAR * target_error:
+                parts[view] = []  # guided samples are so much better that these would only harm
+            else:  # no error falls faster than by the square root
+                due[view] = taken + ((error / target_error) ** 2 - 1) * mine[0].spp
         active, step = left, min(_next(taken) - taken, total - taken)
     return [records[view] for view in order]
 
@@ -106,7 +109,7 @@ def _next(samples: int) -> int:
     return samples * 3 // 2 if power_of_two else samples * 4 // 3
 
 
-def _sampler(
+def _renderer(
     scene: SceneRecord,
     resolution: int,
     seed: int,
@@ -114,26 +117,26 @@ def _sampler(
     mode: str,
     max_depth: int,
     lights_visible: bool,
-) -> Callable[[list[int], list[int], int, int], list[list[Sums]]]:
-    """(views, streams, first sample, samples of each stream) -> per stream, the sums of each view."""
+    guided: bool,
+) -> Any:
+    """A ``ScalarRenderer`` or ``JitRenderer``; guided where it can be and nothing is clamped."""
     if backend["backend"] == "scalar":
         if mode == "cycles":
             raise UserError("mode=cycles needs a JIT backend of Mitsuba, and none works here: " + backends.INSTALL)
         from stages.rendering.scalar import ScalarRenderer
 
-        return ScalarRenderer(scene, resolution, seed, max_depth, lights_visible).sample
+        return ScalarRenderer(scene, resolution, seed, max_depth, lights_visible)
     from stages.rendering.jit import JitRenderer, Limits
 
+    if mode == "physical":
+        return JitRenderer(scene, resolution, seed, Limits(max_depth - 1), lights_visible, guided)
     # Cycles lets light in at the hit behind the last counted bounce, hence 12 + 1.
-    limits = (
-        Limits(max_depth - 1)
-        if mode == "physical"
-        else Limits(min(max_depth - 1, 13), 4, 4, 10.0, "blackman-harris", glossy_filter=True, multiscatter=True)
-    )
-    return JitRenderer(scene, resolution, seed, limits, lights_visible).sample
+    bounces = min(max_depth - 1, 13)
+    limits = Limits(bounces, 4, 4, 10.0, "blackman-harris", glossy_filter=True, multiscatter=True)
+    return JitRenderer(scene, resolution, seed, limits, lights_visible)
 
 
-def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error: float | None) -> ViewRecord:
+def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error: float | None, dropped: int) -> ViewRecord:
     """The stored view: every light denoised on its own (quality None: not at all), and what is to be said of it."""
     nearest = float(sums.nearest.min())
     if quality:
@@ -149,6 +152,7 @@ def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error
         "status": "too_close" if nearest < MIN_DEPTH else "dark" if mean < MIN_MEAN else "ok",
         "mean": mean,
         "spp": sums.spp,
+        "dropped": dropped,
         "error": error,
         "denoiser": quality,
         "clamped": clamped_values(view),

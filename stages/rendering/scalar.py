@@ -23,6 +23,8 @@ GAP = 1e-5  # distance of a light's side from its true plane, over the largest c
 class ScalarRenderer:
     """One scene, ready to be seen from its cameras."""
 
+    guided = False  # Mitsuba's own integrator picks directions by itself
+
     def __init__(self, scene: SceneRecord, resolution: int, seed: int, max_depth: int, lights_visible: bool):
         self.record, self.resolution, self.seed, self.max_depth = scene, resolution, seed, max_depth
         self.lights_visible = lights_visible
@@ -45,6 +47,9 @@ class ScalarRenderer:
         self.shown = np.arange(len(scene.triangles)) if lights_visible else surfaces
         first = {"surface": surface_mesh(scene, self.shown, albedo_only=True)} if len(self.shown) else {}
         self.first_hit_scene = mi.load_dict({"type": "scene", **first})
+
+    def learn(self, views: list[int]) -> None:
+        """As ``JitRenderer``; nothing to do."""
 
     def sample(self, views: list[int], streams: list[int], first: int, spp: int) -> list[list[Sums]]:
         """Per stream, the sums of each view over ``spp`` paths per pixel, the stream's ones from ``first`` on. A light gets

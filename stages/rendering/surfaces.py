@@ -206,7 +206,9 @@ def mesh_of(
     )
     params = mi.traverse(mesh)
     params["vertex_positions"] = floats(triangles)
-    params["faces"] = np.arange(3 * count, dtype=np.uint32) if _scalar() else mi.UInt32(np.arange(3 * count, dtype=np.uint32))
+    params["faces"] = (
+        np.arange(3 * count, dtype=np.uint32) if _scalar() else mi.UInt32(aligned(np.arange(3 * count), np.uint32))
+    )
     if normals is not None:
         params["vertex_normals"] = floats(normals)
     if coordinates is not None:
@@ -220,5 +222,27 @@ def _scalar() -> bool:
 
 
 def floats(values: np.ndarray):
-    flat = np.ascontiguousarray(values, dtype=np.float32).reshape(-1)
+    """Flat numbers for Mitsuba."""
+    flat = aligned(values, np.float32)
     return flat if _scalar() else dr.auto.ad.Float(flat)
+
+
+def gatherable(values: np.ndarray, kind: type | None = None):
+    """A flat array for kernels to gather from; ``kind``: mi.Float by default.
+
+    It has two entries at least: Dr.Jit writes an array of one into the code of a kernel, which is then compiled for each value.
+    """
+    kind = kind or mi.Float
+    flat = aligned(values, {mi.Float: np.float32, mi.UInt32: np.uint32, mi.Int32: np.int32}[kind])
+    return kind(aligned(np.resize(flat, 2), flat.dtype) if len(flat) == 1 else flat)
+
+
+def aligned(values: np.ndarray, dtype: type) -> np.ndarray:
+    """Flat copy that starts at a multiple of 64 bytes: Dr.Jit uses NumPy's memory as it is, and compiles kernels anew for
+    arrays that lie otherwise."""
+    flat = np.ascontiguousarray(values, dtype).reshape(-1)
+    room = np.empty(flat.nbytes + 64, np.uint8)
+    first = -room.ctypes.data % 64
+    out = room[first : first + flat.nbytes].view(dtype)
+    out[:] = flat
+    return out

@@ -167,10 +167,10 @@ def test_textures_travel_with_their_triangles():
             made |= {"patch_index": index, "patches": np.random.default_rng(n).random((textured, 7, 32, 32)).astype(np.float16)}
         return made
 
-    batch = collate([example(3, 2), example(5, 0), example(4, 3)])
+    batch = collate([example(3, 2), example(5, 0), example(4, 3)], 3)
     assert batch["patch_index"].tolist() == [[0, 1, -1, -1, -1], [-1] * 5, [2, 3, 4, -1, -1]]
     assert batch["patches"].shape == (5, 7, 32, 32) and batch["patches"].dtype == np.float16
-    assert "patches" not in collate([example(2, 0)])
+    assert "patches" not in collate([example(2, 0)], 1)
     assert np.array_equal(mirror(example(3, 2))["patches"], example(3, 2)["patches"].transpose(0, 1, 3, 2))
 
 
@@ -224,7 +224,9 @@ def test_only_what_is_wanted_is_decoded(artifact, monkeypatch):
     decoded = []
     for name in ("decode_lights", "decode_layers"):
         real = getattr(shards, name)
-        monkeypatch.setattr(shards, name, lambda data, where, n=name, f=real: decoded.append((n, where)) or f(data, where))
+        monkeypatch.setattr(
+            shards, name, lambda data, where, *a, n=name, f=real: decoded.append((n, where)) or f(data, where, *a)
+        )
     dataset = ShardDataset(artifact, "train", cache_mb=0)
     sample = dataset.read(1, [2])
     assert list(sample.views) == [2] and sample.views[2].normal is None

@@ -248,17 +248,19 @@ def test_scalar_and_jit_agree(jit):
         assert np.abs(getattr(a, name) - getattr(b, name))[flat].max() < tolerance, name
 
 
-def test_bytes_do_not_depend_on_threads(backend):
-    scene = clutter()
-    runs = [hashed(render_views(scene, 16, max_spp=8, seed=2, backend=backend, threads=threads)) for threads in (1, 2, 2)]
+@pytest.mark.parametrize(("spp", "target"), [(8, 0), (48, 1e-9)], ids=["plain", "guided"])
+def test_bytes_do_not_depend_on_threads(backend, spp, target):
+    scene, kept = clutter(), {"max_spp": spp, "target_error": target, "backend": backend}
+    runs = [hashed(render_views(scene, 16, seed=2, threads=threads, **kept)) for threads in (1, 2, 2)]
     assert runs[0] == runs[1] == runs[2]
-    assert hashed(render_views(scene, 16, max_spp=8, seed=3, backend=backend)) != runs[0]
+    assert hashed(render_views(scene, 16, seed=3, **kept)) != runs[0]
 
 
-def test_bytes_do_not_depend_on_views_or_chunks(jit, monkeypatch):
+@pytest.mark.parametrize("target", [0, 1e-9], ids=["plain", "guided"])
+def test_bytes_do_not_depend_on_views_or_chunks(jit, monkeypatch, target):
     from stages.rendering import jit as module
 
-    scene, kept = clutter(), {"max_spp": 44, "seed": 2, "backend": jit, "denoise": False}
+    scene, kept = clutter(), {"max_spp": 44, "seed": 2, "backend": jit, "denoise": False, "target_error": target}
     whole = render_views(scene, 16, **kept)
     assert hashed(render_views(scene, 16, views=[1], **kept)) == hashed(whole)[1:]
     monkeypatch.setattr(module, "CHUNK", 100)  # lanes, of six blocks for each pixel
@@ -309,11 +311,48 @@ def test_samples_are_spent_until_the_target_is_met(backend):
     ]
     for target, metas in zip((1.0, 0.02, 1e-9), needs, strict=True):
         for meta in metas:
-            assert meta["error"] <= target or meta["spp"] == 256
-    first, middle, last = ([meta["spp"] for meta in metas] for metas in needs)
+            assert meta["error"] <= target or meta["spp"] + meta["dropped"] == 256
+    first, middle, last = ([meta["spp"] + meta["dropped"] for meta in metas] for metas in needs)
     assert first == [16, 16] and last == [256, 256] and all(16 <= spp < 256 for spp in middle)
     capped = render_views(scene, 16, max_spp=24, target_error=1e-9, **kept)
     assert [view.meta["spp"] for view in capped] == [24, 24]
+
+
+def caustic():
+    """A rough floor lit by a lamp's reflection in a mirror as much as by the lamp."""
+    surfaces = [
+        (quad((0, 0, -0.5), (0.6, 0, 0), (0, 0.6, 0)), 0.8, 0.0, 1.0),
+        (quad((0, 0.6, 0.1), (0.6, 0, 0), (0, 0, 0.6)), 0.0, 0.9, 0.25),
+    ]
+    lamp = np.array([[[0, -0.6, 1.9], [0.2, -0.6, 1.9], [0, -0.4, 1.9]]])
+    return build(surfaces, [(lamp, 200.0)], [camera((0, -2, 0.8), (0, 0, -0.4))])
+
+
+def test_guiding_finds_caustics_and_keeps_the_mean(jit):
+    from stages.rendering.jit import JitRenderer, Limits
+
+    backends.activate(jit)
+
+    def images(renderer, first, spp):
+        return [sums.lights[0] / spp for (sums,) in renderer.sample([0], [0, 1], first, spp)]
+
+    few, means = {}, {}
+    for guided in (False, True):
+        renderer = JitRenderer(caustic(), 32, 4, Limits(8), False, guided)
+        renderer.sample([0], [0, 1], 0, 16)
+        renderer.learn([0])
+        few[guided], means[guided] = images(renderer, 16, 16), np.mean(images(renderer, 32, 2048))
+    assert means[True] == pytest.approx(means[False], rel=0.005)
+    plain, guided = (np.mean(np.abs(np.subtract(*few[flag]))) for flag in (False, True))
+    assert guided < 0.7 * plain  # twice the samples without guiding
+
+
+def test_first_samples_are_dropped_where_the_target_is_far(jit):
+    kept = {"seed": 0, "backend": jit, "denoise": False}
+    error = render_views(caustic(), 32, max_spp=16, target_error=1e-9, **kept)[0].meta["error"]
+    for max_spp, target, counts in ((128, error / 3, (112, 16)), (128, error / 1.5, (None, 0)), (24, error / 3, (24, 0))):
+        meta = render_views(caustic(), 32, max_spp=max_spp, target_error=target, **kept)[0].meta
+        assert (counts[0] or meta["spp"], counts[1]) == (meta["spp"], meta["dropped"])
 
 
 def test_samples_in_portions_are_the_same_samples(jit):
