@@ -313,17 +313,16 @@ def bench_model(work: Path, options: argparse.Namespace) -> None:
     disk = options.tb_month * (everything * days / 30 + kept * options.months)
     print(f"  {'all':<57}{core_hours:12,.0f}{everything:8.2f}")
     print(f"  {options.cores:,} CPU cores: {days:.1f} days, {options.use:.0%} of them at work")
+    print(f"  {options.gpus} GPUs of one node: render it in {on_gpus:.1f} days, a GPU taken for {options.gpu_cores:g} cores")
     print(
-        f"  a node of {options.gpus} GPUs: renders it in {on_gpus:.1f} days, a GPU taken for {options.gpu_cores:g} of these cores"
+        f"  {options.gpus} A100s of one node: train paper_256 in {train:.1f} days, at 40 % of their peak (the authors: 5 days)"
     )
-    print(f"  a node of {options.gpus} A100s: trains paper_256 in {train:.1f} days, at 40 % of its peak (the authors: 5 days)")
+    print("  USD:")
+    print(f"  {cores:10,.0f} for cores, at {options.core_hour:g} a core-hour")
+    print(f"  {node:10,.0f} for training, at {options.node_hour:g} a node-hour")
     print(
-        f"  USD: {cores:,.0f} for cores ({options.core_hour:g} a core-hour), {node:,.0f} for training ({options.node_hour:g} a node-hour),"
+        f"  {disk:10,.0f} for disks, at {options.tb_month:g} a TB-month: all while it runs, the shards {options.months:g} months more"
     )
-    print(
-        f"  {disk:,.0f} for disks ({options.tb_month:g} a TB-month: {everything:.1f} TB for the run, the shards' {kept:.1f} TB for"
-    )
-    print(f"  {options.months:g} months more)")
 
 
 def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
