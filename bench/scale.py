@@ -321,7 +321,7 @@ def bench_model(work: Path, options: argparse.Namespace) -> None:
     print(f"  {cores:10,.0f} for cores, at {options.core_hour:g} a core-hour")
     print(f"  {node:10,.0f} for training, at {options.node_hour:g} a node-hour")
     print(
-        f"  {disk:10,.0f} for disks, at {options.tb_month:g} a TB-month: all while it runs, the shards {options.months:g} months more"
+        f"  {disk:10,.0f} for disks, at {options.tb_month:g} a TB-month: all during the run, shards {options.months:g} months"
     )
 
 
