@@ -10,6 +10,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -56,6 +57,21 @@ def replace(temporary: Path, final: Path) -> None:
     os.replace(temporary, final)
 
 
+def _check_shapes(config: ModelConfig, stored: Mapping[str, tuple[int, ...]], path: Path) -> None:
+    """That the file holds the network which the config asks for, before a byte of either is allocated."""
+    layers = config.num_layers + config.view_transformer_n_layers
+    if layers > len(stored):
+        raise ValueError(f"{path} holds {len(stored)} tensors, {CONFIG} asks for {layers} layers")
+    with torch.device("meta"):
+        own = {name: tuple(tensor.shape) for name, tensor in RenderFormer(config).state_dict().items()}
+    for what, which in (("unknown", stored.keys() - own.keys()), ("missing", own.keys() - stored.keys())):
+        if which:
+            raise ValueError(f"{path}: {what} parameter {', '.join(sorted(which))} for the network of {CONFIG}")
+    for name, shape in stored.items():
+        if shape != own[name]:
+            raise ValueError(f"{path}: {name} has shape {shape}, {CONFIG} asks for {own[name]}")
+
+
 def load(folder: Path) -> tuple[RenderFormer, dict[str, str]]:
     """The model, on the CPU in float32 and in eval mode, and what it says it was trained with (may be empty)."""
     folder = Path(folder)
@@ -63,19 +79,13 @@ def load(folder: Path) -> tuple[RenderFormer, dict[str, str]]:
     path = folder / WEIGHTS
     if not path.is_file():
         raise ValueError(f"{path} is missing: a checkpoint folder holds {CONFIG} and {WEIGHTS}")
-    model = RenderFormer(config)
-    own = model.state_dict()
     try:
         with safe_open(path, framework="pt") as file:
-            names, metadata = set(file.keys()), file.metadata() or {}
-            state = {name: file.get_tensor(name) for name in sorted(names & set(own))}
+            metadata = file.metadata() or {}
+            _check_shapes(config, {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}, path)  # noqa: SIM118
+            state = {name: file.get_tensor(name) for name in sorted(file.keys())}
     except SafetensorError as error:
         raise ValueError(f"{path} is not a safetensors file: {error}") from None
-    for what, which in (("unknown", names - set(own)), ("missing", set(own) - names)):
-        if which:
-            raise ValueError(f"{path}: {what} parameter {', '.join(sorted(which))} for the network of {CONFIG}")
-    for name, tensor in state.items():
-        if tensor.shape != own[name].shape:
-            raise ValueError(f"{path}: {name} has shape {tuple(tensor.shape)}, {CONFIG} asks for {tuple(own[name].shape)}")
+    model = RenderFormer(config)
     model.load_state_dict(state)
     return model.eval(), {name: value for name, value in metadata.items() if name != "format"}

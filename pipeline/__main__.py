@@ -6,10 +6,13 @@ computed before the first one starts, and a job whose key has changed by then st
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 
 import hydra
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -18,7 +21,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from pipeline.errors import UserError
+from pipeline.errors import INTERRUPTED, STORAGE_ERRORS, UserError, status_of
 from pipeline.hydra_config import CONF, compose, to_plain
 from pipeline.runner import make_plan, run_pipeline, split_config
 from pipeline.store import HashCache, Store
@@ -40,8 +43,46 @@ def sweep_keys(overrides: Sequence[str]) -> dict[str, dict[str, str]]:
     return {" ".join(job): plan_keys(compose(job)) for job in jobs}
 
 
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Ctrl-C stops the workers and the run in order; a second one ends the process at once, and Linux its workers with it."""
+
+    def at_once(number: int, frame: object) -> None:
+        os._exit(INTERRUPTED)
+
+    def in_order(number: int, frame: object) -> None:
+        signal.signal(signal.SIGINT, at_once)
+        os.write(2, b"interrupted: stopping (Ctrl-C again: at once)\n")
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, in_order)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def guarded(work: Callable[[], None], debug: bool = False) -> int:
+    """Do the work; an error that a person can mend becomes one line and its exit status, which is returned."""
+    try:
+        with interruptible():
+            work()
+    except (ValueError, OSError) as error:
+        if debug or (isinstance(error, OSError) and error.errno not in STORAGE_ERRORS):
+            raise
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        return status_of(error)
+    except KeyboardInterrupt:
+        print("interrupted: what is finished is kept, the same command continues", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
 def main(words: Sequence[str] | None = None) -> int:
-    """Returns the exit status: 0 done, 1 failed, 2 the user can mend it, 130 interrupted."""
+    """Returns the exit status: 0 done, 130 interrupted, or that of the first error (see pipeline.errors)."""
     words = list(sys.argv[1:] if words is None else words)
     debug = "--debug" in words or "debug=true" in words
     words = [word for word in words if word != "--debug"]
@@ -49,7 +90,7 @@ def main(words: Sequence[str] | None = None) -> int:
     overrides = [word for word in words if word not in MULTIRUN_FLAGS]
     hydra_flags = [word for word in overrides if word.startswith("-") and word not in ("-",)]
     command = ["python", "-m", "pipeline", *words]
-    failures: list[str] = []
+    failures: list[int] = []
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
     def job(config: DictConfig) -> None:
@@ -65,12 +106,12 @@ def main(words: Sequence[str] | None = None) -> int:
                     )
             run_pipeline(root, command, lambda text: print(text, flush=True))
         except ValueError as error:  # UserError, and what model/ says of bad input
-            if debug or not isinstance(error, ValueError):
+            if debug:
                 raise
-            failures.append(str(error))
+            failures.append(status_of(error))
             print(f"error: {error}", file=sys.stderr, flush=True)
 
-    try:
+    def compose_and_run() -> None:
         if not hydra_flags:
             if flags:
                 os.environ[SWEEP_VARIABLE] = json.dumps(sweep_keys(overrides))
@@ -79,17 +120,12 @@ def main(words: Sequence[str] | None = None) -> int:
         sys.argv = ["lightmill", *flags[:1], *overrides]
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")
         job()
-    except ValueError as error:
-        if debug:
-            raise
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted: what is finished is kept, the same command continues", file=sys.stderr)
-        return 130
+
+    try:
+        status = guarded(compose_and_run, debug)
     finally:
         os.environ.pop(SWEEP_VARIABLE, None)
-    return 2 if failures else 0
+    return status or (failures[0] if failures else 0)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""The commands for people: ls, show, why, verify, gc, pin. Each is a function that a command line mounts."""
+"""The commands for people: ls, status, show, why, verify, repair, gc, pin. Each is a function that a command line mounts."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import shutil
 import time
@@ -10,10 +11,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import UserError
+from pipeline.errors import Damaged, UserError
 from pipeline.hydra_config import compose
 from pipeline.progress import duration
+from pipeline.repair import repair
 from pipeline.runner import make_plan, split_config
+from pipeline.status import lines, read_states
 from pipeline.store import Artifact, HashCache, Store, iter_inputs
 
 
@@ -66,6 +69,10 @@ def command_ls(store: Store, arguments: argparse.Namespace) -> int:
             state = f"in the making by process {holder['pid']} on {holder['host']}" if holder else "unfinished"
             parts = len(list((path / "markers").glob("*.json")))
             print(f"{path.parent.name}/{path.name[:12]}.partial  {parts} parts, {state}")
+    readable = {artifact.path for artifact in artifacts}
+    for path in store.folders(arguments.stage):
+        if path not in readable:
+            print(f"{path.parent.name}/{path.name:<30} damaged: `lightmill verify` says how, `lightmill repair` makes it anew")
     if not artifacts:
         print(f"no artifacts in {store.root}")
     return 0
@@ -85,7 +92,7 @@ def command_show(store: Store, arguments: argparse.Namespace) -> int:
         print(f"  rejected  {count} {reason}")
     for reject in artifact.rejects()[: arguments.rejects]:
         print(f"            {reject['item']}: {reject['reason']}: {reject['detail']}")
-    seconds = manifest["finished"] - manifest["started"]
+    seconds = manifest.get("seconds", manifest["finished"] - manifest["started"])
     when = time.strftime("%Y-%m-%d %H:%M", time.localtime(manifest["finished"]))
     code = manifest["code"]
     print(
@@ -196,18 +203,43 @@ def _explain(
         print(f"{indent}nothing differs")
 
 
+def command_status(store: Store, arguments: argparse.Namespace) -> int:
+    states = read_states(store, arguments.stage)
+    if arguments.json:
+        print(json.dumps(states, indent=1))
+        return 0
+    made = {artifact.stage: artifact.manifest["finished"] for artifact in store.artifacts()}
+    for state in states:
+        print("\n".join(lines(state, made)))
+    if not states:
+        newest = max(made.values(), default=None)
+        when = f"; the newest artifact was made {duration(time.time() - newest)} ago" if newest else ""
+        print(f"nothing is running or unfinished in {store.root}{when}")
+    return 0
+
+
 def command_verify(store: Store, arguments: argparse.Namespace) -> int:
-    artifacts = [store.resolve(name) for name in arguments.artifacts] or store.artifacts()
+    if arguments.artifacts:
+        artifacts = [store.resolve(name) for name in arguments.artifacts]
+    else:
+        artifacts = [Artifact(path) for path in store.folders()]
     bad = 0
     for artifact in artifacts:
         problems = artifact.verify(deep=arguments.deep)
         bad += bool(problems)
-        print(f"{artifact.stage}/{artifact.path.name}: {'sound' if not problems else f'{len(problems)} problem(s)'}")
+        name = f"{artifact.path.parent.name}/{artifact.path.name}"
+        print(f"{name}: {'sound' if not problems else f'{len(problems)} problem(s); lightmill repair {name} makes it anew'}")
         for problem in problems:
             print(f"  {problem}")
     how = "every byte read" if arguments.deep else "sizes and listings; --deep reads every byte"
     print(f"{len(artifacts) - bad} of {len(artifacts)} artifacts sound ({how})")
-    return 1 if bad else 0
+    return Damaged.status if bad else 0
+
+
+def command_repair(store: Store, arguments: argparse.Namespace) -> int:
+    for reference in arguments.artifacts:
+        repair(store, store.resolve(reference), arguments.workers)
+    return 0
 
 
 def command_gc(store: Store, arguments: argparse.Namespace) -> int:
@@ -249,6 +281,9 @@ def add_commands(parsers: Any, program: str) -> None:
 
     parser = add("ls", command_ls, "list artifacts and unfinished work", "render")
     parser.add_argument("stage", nargs="?", help="only this stage")
+    parser = add("status", command_status, "what runs, how far it is, what failed; and what was left unfinished", "")
+    parser.add_argument("stage", nargs="?", help="only this stage")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     parser = add("show", command_show, "show one artifact: config, counts, rejects, summary, lineage", "render")
     parser.add_argument("artifact", help="a key or its beginning, stage/folder, or a stage's name for its newest")
     parser.add_argument("--rejects", type=int, default=10, help="how many rejects to list (default: 10)")
@@ -257,6 +292,9 @@ def add_commands(parsers: Any, program: str) -> None:
     parser = add("verify", command_verify, "check artifacts against their manifests", "--deep")
     parser.add_argument("artifacts", nargs="*", help="which (default: all)")
     parser.add_argument("--deep", action="store_true", help="read and hash every byte")
+    parser = add("repair", command_repair, "make the damaged parts of an artifact anew and swap them in", "render")
+    parser.add_argument("artifacts", nargs="+", help="as for show")
+    parser.add_argument("--workers", type=int, help="worker processes (default: one per core)")
     parser = add("gc", command_gc, "delete what is unpinned, unused and not an input of a kept artifact", "--days 14 --delete")
     parser.add_argument("--days", type=float, default=14.0, help="keep what was used within so many days (default: 14)")
     parser.add_argument("--delete", action="store_true", help="really delete; without it only the list is printed")

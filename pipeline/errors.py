@@ -1,11 +1,45 @@
-"""The two kinds of trouble a person can have with the engine, apart from bugs (which stay ordinary exceptions)."""
+"""The kinds of trouble a person can have with the engine, apart from bugs (which stay ordinary exceptions).
+
+Each kind has an exit status of its own, so that scripts can tell what may be run again as it is (docs/faults.md).
+"""
+
+import errno
+
+INTERRUPTED = 130  # the shells' number for Ctrl-C
+STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.ESTALE}  # the disk's fault, no item's
 
 
 class UserError(ValueError):
     """Something the user can mend. The message says what was given, what was expected and what to do.
 
-    Commands print it as one line and exit with status 2; ``--debug`` shows the traceback.
+    Commands print it as one line and exit with ``status``; ``--debug`` shows the traceback.
     """
+
+    status = 2
+
+
+class ItemsFailed(UserError):
+    """Exceptions in single items, a bug or a library's: their parts are missing, all others are kept."""
+
+    status = 3
+
+
+class TooManyRejects(UserError):
+    """More items were rejected than ``max_reject_share`` allows."""
+
+    status = 4
+
+
+class Damaged(UserError):
+    """Bytes in the store are not those that were written: ``lightmill repair`` makes them anew."""
+
+    status = 5
+
+
+class MachineError(UserError):
+    """The machine, not the config: a disk that is full or read-only, workers that keep dying. Run again when mended."""
+
+    status = 6
 
 
 class Reject(Exception):
@@ -22,3 +56,10 @@ class Reject(Exception):
 
     def __str__(self) -> str:
         return f"{self.reason}: {self.detail}" if self.detail else self.reason
+
+
+def status_of(error: BaseException) -> int:
+    """The exit status of a command that stops with this error."""
+    if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
+        return MachineError.status
+    return getattr(error, "status", UserError.status if isinstance(error, (ValueError, OSError)) else 1)

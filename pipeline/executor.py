@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import json
 import multiprocessing
 import os
@@ -15,6 +16,7 @@ import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ import psutil
 from pebble import ProcessExpired, ProcessPool
 
 from pipeline.config import Limits
-from pipeline.errors import UserError
+from pipeline.errors import MachineError
 from pipeline.worker import (
     THREADS_VARIABLE,
     PartResult,
@@ -31,9 +33,11 @@ from pipeline.worker import (
     die_with_parent,
     run_part,
     running_file,
+    write_log,
 )
 
 POLL_S = 0.25
+MAX_POOLS = 8  # that break as a whole
 MAX_UNEXPLAINED = 4  # deaths of a part's worker beyond what its items can explain
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -76,19 +80,53 @@ def run_parts(
             close_workers()
         return
     waiting = iter(tasks)
+    for _ in range(MAX_POOLS):
+        try:
+            with open_pool(workers, threads) as pool:
+                run_on(pool, waiting, workers, limits, on_result, log)
+            return
+        except PoolBroken as broken:
+            log("the worker processes died before they began, or while they were given work: starting new ones")
+            waiting = itertools.chain(broken.tasks, waiting)
+    raise MachineError("worker processes keep dying as they start: look at the machine's memory; finished parts are kept")
+
+
+class PoolBroken(Exception):
+    """The pool can do no more (a worker was killed at the pool's own business); ``tasks`` are still to be done."""
+
+    def __init__(self, tasks: Iterable[PartTask]):
+        super().__init__()
+        self.tasks = list(tasks)
+
+
+@contextlib.contextmanager
+def open_pool(workers: int, threads: int) -> Iterator[ProcessPool]:
+    """Processes for parts, with ``threads`` native threads each; they end with this process."""
     with _threads(threads):
         pool = ProcessPool(max_workers=workers, initializer=die_with_parent, context=multiprocessing.get_context("spawn"))
         try:
-            _run_pool(pool, waiting, workers, limits, on_result, log)
+            with _uninterrupted():
+                assert pool.active  # starts the processes and the threads that replace them
+            yield pool
             pool.close()
-            pool.join()
         except BaseException:
             pool.stop()
-            pool.join()
             raise
+        finally:
+            pool.join()
 
 
-def _run_pool(
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Threads and processes that begin in here never see Ctrl-C, not even while they import: it is the runner's business."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def run_on(
     pool: ProcessPool,
     waiting: Iterator[PartTask],
     workers: int,
@@ -96,13 +134,17 @@ def _run_pool(
     on_result: Callable[[PartResult], None],
     log: Callable[[str], None],
 ) -> None:
+    """Run all tasks on the pool's ``workers``, at most twice as many at a time, and hold their items to the limits."""
     flying: dict[Any, PartTask] = {}
     verdicts: dict[str, tuple[str, str]] = {}  # part key -> (reason, detail) of the kill that we made ourselves
     deaths: dict[str, int] = {}  # part key -> workers that died over it
     exhausted = False
 
     def submit(task: PartTask) -> None:
-        flying[pool.schedule(run_part, args=[task])] = task
+        try:
+            flying[pool.schedule(run_part, args=[task])] = task
+        except RuntimeError:
+            raise PoolBroken([task, *flying.values()]) from None
 
     while True:
         while not exhausted and len(flying) < 2 * workers:
@@ -118,10 +160,12 @@ def _run_pool(
             task = flying.pop(future)
             try:
                 on_result(future.result())
+            except BrokenProcessPool:
+                raise PoolBroken([task, *flying.values()]) from None
             except ProcessExpired as death:
                 deaths[task.part_key] = deaths.get(task.part_key, 0) + 1
                 if deaths[task.part_key] > 2 * len(task.items) + MAX_UNEXPLAINED:
-                    raise UserError(
+                    raise MachineError(
                         f"{task.stage}: workers keep dying (exit code {death.exitcode}) and no item is to blame: "
                         "look at the machine's memory and at the logs; finished parts are kept"
                     ) from None
@@ -143,10 +187,12 @@ def _after_death(
         return task
     item = state["item"]
     reason, detail = verdict or ("crash", f"worker died with exit code {death.exitcode}")
+    what = f"{item}: {detail}; " + (f"rejected as {reason}" if task.first == item else "trying it once more, alone")
+    log(f"{task.stage}: {what}")
+    with contextlib.suppress(OSError):
+        write_log(task.draft, task.part_key, what)
     if task.first != item:
-        log(f"{task.stage}: {item}: {detail}; trying it once more, alone")
         return dataclasses.replace(task, first=item)
-    log(f"{task.stage}: {item}: {detail}; rejected as {reason}")
     killed = {**task.killed, item: {"reason": reason, "detail": detail, "machine": True}}
     return dataclasses.replace(task, first=None, killed=killed)
 
@@ -164,12 +210,14 @@ def _hold_to_limits(task: PartTask, limits: Limits, verdicts: dict[str, tuple[st
         return
     try:
         process = psutil.Process(state["pid"])
+        if process.ppid() != os.getpid():  # a file that an earlier run or another machine left
+            return
         times = process.cpu_times()
         cpu_s = times.user + times.system - state["cpu_s"]
         memory_gb = process.memory_info().rss / 2**30
     except psutil.Error:
         return
-    wall_s = time.time() - state["time"]
+    wall_s = time.monotonic() - state["monotonic"]
     if cpu_s > limits.cpu_s:
         verdict = "time", f"over {limits.cpu_s:g} s of CPU time"
     elif wall_s > limits.wall_s:

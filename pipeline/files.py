@@ -1,4 +1,4 @@
-"""Durable file operations and the deterministic tar that parts are made of."""
+"""Durable file operations, JSON that notices damage, and the deterministic tar that parts are made of."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from pipeline.keys import blake
+
 
 def sync_folder(folder: Path) -> None:
     """Make renames and new names in ``folder`` survive a power cut."""
@@ -21,24 +23,64 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write ``data`` to a temporary name, flush it to disk, rename: readers see all of it or none."""
+def write_atomic(path: Path, data: bytes | Iterable[bytes]) -> None:
+    """Write ``data``, whole or in pieces, to a temporary name, flush it to disk, rename: readers see all of it or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
-    with open(temporary, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            file.writelines([data] if isinstance(data, bytes) else data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
     sync_folder(path.parent)
 
 
+def _json(value: Any) -> bytes:
+    return (json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n").encode()
+
+
 def write_json(path: Path, value: Any) -> None:
-    write_atomic(path, (json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n").encode())
+    write_atomic(path, _json(value))
+
+
+UNSEALED = "0" * 64
+
+
+def write_sealed(path: Path, value: Mapping[str, Any]) -> None:
+    """JSON that notices damage: ``check`` is the hash of the file's own bytes with that hash replaced by zeros."""
+    data = _json({**value, "check": UNSEALED})
+    write_atomic(path, data.replace(_check(UNSEALED), _check(blake(data)), 1))
+
+
+def read_sealed(path: Path, schema: int = 0) -> dict[str, Any]:
+    """What ``write_sealed`` wrote; ValueError where a byte has changed. Below ``schema`` a file may be without a seal."""
+    data = path.read_bytes()
+    value = json.loads(data)
+    check = value.pop("check", None) if isinstance(value, dict) else None
+    if check is None and not (isinstance(value, dict) and value.get("schema", schema) < schema):
+        raise ValueError("it has no check sum")
+    if check is not None and blake(data.replace(_check(check), _check(UNSEALED), 1)) != check:
+        raise ValueError("its bytes are not those that were written")
+    return value
+
+
+def _check(digest: Any) -> bytes:
+    return f'"check": "{digest}"'.encode()
+
+
+_encode = json.JSONEncoder(sort_keys=True, ensure_ascii=False).encode
+
+
+def json_line(value: Mapping[str, Any]) -> bytes:
+    return _encode(value).encode() + b"\n"
 
 
 def write_jsonl(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    write_atomic(path, b"".join(json.dumps(row, sort_keys=True, ensure_ascii=False).encode() + b"\n" for row in rows))
+    write_atomic(path, (json_line(row) for row in rows))
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:

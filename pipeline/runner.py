@@ -2,30 +2,46 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import platform
 import shlex
+import shutil
 import socket
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
+from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
+from pipeline.cluster import Cluster, DaskExecutor, Executor, LocalExecutor
 from pipeline.code import code_digest, commit
 from pipeline.config import Limits, Section, StageConfig, nearest, parse
-from pipeline.errors import UserError
+from pipeline.errors import (
+    INTERRUPTED,
+    STORAGE_ERRORS,
+    Damaged,
+    ItemsFailed,
+    MachineError,
+    TooManyRejects,
+    UserError,
+    status_of,
+)
 from pipeline.executor import run_parts
 from pipeline.keys import SCHEME, canonical, digest_of
 from pipeline.progress import Progress, duration
 from pipeline.stage import Item, MapStage, RunStage, Stage, System, load_system
-from pipeline.store import SCHEMA, Artifact, Draft, HashCache, Store
-from pipeline.worker import PartResult, PartTask, Reuse
+from pipeline.status import RunState
+from pipeline.store import DRAFT, SCHEMA, Artifact, Claim, Draft, HashCache, Store
+from pipeline.worker import PartResult, PartTask, Reuse, log_file
 
 
 class RunConfig(Section):
@@ -39,6 +55,7 @@ class RunConfig(Section):
     plan: bool = False  # print the plan and stop
     workers: int | Literal["auto"] = Field("auto")  # worker processes; auto: one per core; 0: none, in this process
     debug: bool = False  # tracebacks instead of one-line errors
+    executor: Executor = LocalExecutor()  # where parts are made
 
 
 def split_config(root: Mapping[str, Any]) -> tuple[RunConfig, System, dict[str, Any]]:
@@ -48,6 +65,8 @@ def split_config(root: Mapping[str, Any]) -> tuple[RunConfig, System, dict[str, 
         if name in engine:
             value = engine[name]
             engine[name] = value.split(",") if isinstance(value, str) else value or []
+    if "executor" in engine:
+        engine["executor"] = parse(Executor, engine["executor"], "executor")
     run = parse(RunConfig, engine, "config")
     system = load_system(run.system)
     known = {*RunConfig.model_fields, *system.modules, *system.groups}
@@ -80,19 +99,20 @@ def make_plan(
         if name not in sections:
             raise UserError(f"the config has no section {name!r} for the stage of that name")
         config = parse(stage.Config, sections[name], name)
-        params = canonical(config, name)
-        identity = stage.identity(config, hash_file)
-        if identity:
-            params = {**params, "identity": canonical(identity, f"{name}.identity")}
-        preimage = {
-            "scheme": SCHEME,
-            "stage": name,
-            "version": stage.version,
-            "params": params,
-            "inputs": {parent: plan[parent].key for parent in stage.reads(config)},
-        }
-        plan[name] = Planned(name, stage, config, digest_of(preimage), preimage)
+        plan[name] = plan_stage(stage, config, {parent: plan[parent].key for parent in stage.reads(config)}, hash_file)
     return plan
+
+
+def plan_stage(stage: Stage, config: StageConfig, inputs: Mapping[str, str], hash_file: Callable[[Any], str]) -> Planned:
+    """The stage with this config and input keys, and with the key that they give."""
+    params = canonical(config, stage.name)
+    identity = stage.identity(config, hash_file)
+    if identity:
+        params = {**params, "identity": canonical(identity, f"{stage.name}.identity")}
+    preimage = {
+        "scheme": SCHEME, "stage": stage.name, "version": stage.version, "params": params, "inputs": dict(inputs),
+    }  # fmt: skip
+    return Planned(stage.name, stage, config, digest_of(preimage), preimage)
 
 
 def without_counts(config: BaseModel, params: Mapping[str, Any]) -> dict[str, Any]:
@@ -141,30 +161,41 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
     for name in run.force:
         if name not in plan:
             raise UserError(f"force={name}: the stage is not among those that stage={','.join(run.stage)} needs")
-    artifacts: dict[str, Artifact | None] = {name: store.find(name, planned.key) for name, planned in plan.items()}
+    artifacts: dict[str, Artifact | None] = {}
+    damaged: dict[str, Damaged] = {}
+    for name, planned in plan.items():
+        try:
+            artifacts[name] = store.find(name, planned.key)
+        except Damaged as error:
+            artifacts[name], damaged[name] = None, error
     todo = _todo(run, plan, artifacts)
+    for name, error in damaged.items():
+        if name in todo and name not in run.force:
+            raise error
     if int(os.environ.get("WORLD_SIZE", "1")) > 1 and run.force:
         raise UserError(f"force={','.join(run.force)} needs a process of its own: run it without torchrun")
     if int(os.environ.get("RANK", "0")) > 0 and not run.plan:  # one of several processes that torchrun started
         return _follow(plan, todo, store)
-    for name, planned in plan.items():
-        artifact = artifacts[name]
-        if name in todo:
-            if run.plan:
-                out(f"{_label(system, name)} to make   key {planned.key[:12]}")
-                for line in planned.stage.estimate(planned.config, {other: plan[other].config for other in plan}):
-                    out(f"      {line}")
+    with Cluster(run.executor, out) if isinstance(run.executor, DaskExecutor) else contextlib.nullcontext() as cluster:
+        for name, planned in plan.items():
+            artifact = artifacts[name]
+            if name in todo:
+                if run.plan:
+                    out(f"{_label(system, name)} to make   key {planned.key[:12]}")
+                    for line in planned.stage.estimate(planned.config, {other: plan[other].config for other in plan}):
+                        out(f"      {line}")
+                else:
+                    inputs = {parent: artifacts[parent] for parent in planned.stage.reads(planned.config)}
+                    assert all(inputs.values())
+                    rest = [other for other in plan if other in todo]
+                    artifacts[name] = make_artifact(run, system, planned, inputs, store, command, out, rest, cluster)  # type: ignore[arg-type]
+            elif artifact is not None:
+                store.touch(artifact.key)
+                out(f"{_label(system, name)} up to date {_describe(artifact)}")
+                if artifact.manifest["code"]["digest"] != code_digest(system, name):
+                    out(f"   note: the code of {name} has changed since, its version has not (force={name} recomputes)")
             else:
-                inputs = {parent: artifacts[parent] for parent in planned.stage.reads(planned.config)}
-                assert all(inputs.values())
-                artifacts[name] = _make(run, system, planned, inputs, store, command, out)  # type: ignore[arg-type]
-        elif artifact is not None:
-            store.touch(artifact.key)
-            out(f"{_label(system, name)} up to date {_describe(artifact)}")
-            if artifact.manifest["code"]["digest"] != code_digest(system, name):
-                out(f"   note: the code of {name} has changed since, its version has not (force={name} recomputes)")
-        else:
-            out(f"{_label(system, name)} not needed key {planned.key[:12]}")
+                out(f"{_label(system, name)} not needed key {planned.key[:12]}")
     for name in run.stage:
         artifact = artifacts[name]
         headline = plan[name].stage.headline
@@ -216,7 +247,7 @@ def _describe(artifact: Artifact) -> str:
     return text
 
 
-def _make(
+def make_artifact(
     run: RunConfig,
     system: System,
     planned: Planned,
@@ -224,32 +255,43 @@ def _make(
     store: Store,
     command: Sequence[str],
     out: Callable[[str], None],
+    plan: Sequence[str] = (),
+    cluster: Cluster | None = None,
+    adopt: Callable[[Draft], None] = lambda draft: None,
 ) -> Artifact:
-    """Compute one artifact and commit it."""
+    """Compute one artifact and commit it. ``plan``: the stages of the whole run, for its state; ``adopt`` fills the draft."""
     name, key = planned.name, planned.key
     forced = name in run.force
     claim = store.claim(name, key)
-    told = False
-    while (holder := claim.holder()) is not None:
-        if not told:
-            out(f"{_label(system, name)} waiting: process {holder['pid']} on {holder['host']} is making {key[:12]}")
-            told = True
-        time.sleep(1.0)
-        existing = store.find(name, key)
-        if existing is not None and not forced:
-            return existing
-    draft = store.draft(name, key, planned.preimage, out)
-    claim.take()
+    draft_path = store.draft_path(name, key)
+    state: RunState | None = None
+    began = time.monotonic()
     try:
+        made = _take(claim, store, planned, forced, lambda text: out(f"{_label(system, name)} {text}"))
+        if made is not None:
+            return made
+
+        def say(text: str) -> None:
+            if state is not None:
+                state.update(line=text)
+            out(text)
+
+        origin = {"system": run.system, "config": planned.config.model_dump(mode="json")}
+        draft = store.draft(name, key, planned.preimage, say, origin)
+        draft.sweep()
+        state = RunState(draft.path, command=shlex.join(command), plan=list(plan))
         started = time.time()
-        previous = store.find(name, key)
-        old_digest = previous.digest if previous else None
+        old_digest = _digest_of(store, name, key)
+        adopt(draft)
         environment = draft.environment()
-        environment = planned.stage.environment(planned.config, environment)
+        if cluster is not None and isinstance(planned.stage, MapStage):
+            environment = cluster.environment(run.system, name, planned.config, environment)
+        else:
+            environment = planned.stage.environment(planned.config, environment)
         draft.set_environment(environment)
         if isinstance(planned.stage, MapStage):
             products: list[str] = []
-            _run_map(run, system, planned, planned.stage, inputs, environment, store, draft, forced, out)
+            _run_map(run, system, planned, planned.stage, inputs, environment, store, cluster, draft, forced, out, state)
         else:
             assert isinstance(planned.stage, RunStage)
             out(f"{_label(system, name)} running    {planned.stage.slug(planned.config)}-{key[:12]}")
@@ -260,6 +302,7 @@ def _make(
             "key": key,
             "preimage": planned.preimage,
             "base_key": base_key(planned),
+            **origin,
             "code": {"digest": code_digest(system, name), **commit()},
             "environment": environment,
             "machine": machine(system.packages),
@@ -268,12 +311,30 @@ def _make(
             "command": shlex.join(command),
             "started": started,
             "finished": time.time(),
+            "seconds": time.monotonic() - began,
         }
         artifact = store.commit(draft, planned.stage.slug(planned.config), manifest, replace=forced)
-    except OSError as error:
-        if error.errno in (28, 30, 122):  # no space, read-only, quota
-            raise UserError(f"{name}: {error.strerror} at {error.filename}; finished parts are kept, run again") from None
-        raise
+    except BaseException as error:
+        if not (draft_path / DRAFT).exists() and isinstance(error, Exception) and not forced:
+            made = store.find(name, key)
+            if made is not None:  # another process took the claim from us, and was faster
+                shutil.rmtree(draft_path, ignore_errors=True)
+                out(f"{_label(system, name)} done       {_describe(made)}  by another process meanwhile")
+                return made
+        if isinstance(error, OSError) and (error.errno in STORAGE_ERRORS or str(error.filename).startswith(f"{store.root}/")):
+            where = f" ({error.filename})" if error.filename else ""
+            error = MachineError(
+                f"{name}: the store at {store.root} cannot be written: {error.strerror}{where}. Finished parts are kept: make "
+                "room or mend the disk, and run the same command again"
+            )
+        if state is not None:
+            with contextlib.suppress(OSError):
+                draft.sweep()  # on a full disk it is room to go on with
+            interrupted = isinstance(error, KeyboardInterrupt)
+            state.end(
+                INTERRUPTED if interrupted else status_of(error), "interrupted" if interrupted else str(error) or repr(error)
+            )
+        raise error
     finally:
         claim.release()
     verdict = ""
@@ -281,8 +342,28 @@ def _make(
         verdict = "  equal to before" if artifact.digest == old_digest else "  DIFFERENT from before"
         if artifact.digest != old_digest:
             verdict += f" ({old_digest[:12]} is now {artifact.digest[:12]}); later stages still hold what was made from the old"
-    out(f"{_label(system, name)} done       {_describe(artifact)}  in {duration(time.time() - started)}{verdict}")
+    out(f"{_label(system, name)} done       {_describe(artifact)}  in {duration(time.monotonic() - began)}{verdict}")
     return artifact
+
+
+def _take(claim: Claim, store: Store, planned: Planned, forced: bool, say: Callable[[str], None]) -> Artifact | None:
+    """Wait for the claim. Returns the artifact if another process has made it by then."""
+    told = False
+    while not claim.take():
+        if not told and (holder := claim.holder()) is not None:
+            say(f"waiting: process {holder['pid']} on {holder['host']} is making {planned.key[:12]}")
+            told = True
+        time.sleep(0.5)
+    return None if forced else store.find(planned.name, planned.key)
+
+
+def _digest_of(store: Store, stage: str, key: str) -> str | None:
+    """The digest of the artifact that is about to be replaced, if it is there and can still say so."""
+    try:
+        previous = store.find(stage, key)
+    except Damaged:
+        return None
+    return previous.digest if previous else None
 
 
 def _parts(items: Sequence[Item], keys: Sequence[str], size: int) -> Iterator[tuple[str, list[int]]]:
@@ -305,26 +386,31 @@ def _run_map(
     inputs: Mapping[str, Artifact],
     environment: dict[str, Any],
     store: Store,
+    cluster: Cluster | None,
     draft: Draft,
     forced: bool,
     out: Callable[[str], None],
+    state: RunState,
 ) -> None:
     config = planned.config
     items = sorted(stage.items(config, inputs), key=lambda item: (item.group, item.id))
     if len({item.id for item in items}) != len(items):
         raise AssertionError(f"{planned.name} lists an item twice")
     keys = item_keys(planned, items, inputs)
-    donors = {} if forced else _donations(planned, store, environment, set(keys))
-    markers: dict[str, dict[str, Any] | None] = {}
-    tasks: list[PartTask] = []
-    total, reused = len(items), 0
+    donors = {} if forced else _donations(planned, store, environment, keys)
+    parts: dict[str, tuple[str, tuple[Item, ...], tuple[str, ...]]] = {}
     for group, indices in _parts(items, keys, stage.part_size(config, inputs)):
-        part_items = tuple(items[index] for index in indices)
         part_item_keys = tuple(keys[index] for index in indices)
         part_key = digest_of({"group": group, "items": part_item_keys})
-        markers[part_key] = draft.marker(part_key)
-        if markers[part_key] is not None:
+        parts[part_key] = group, tuple(items[index] for index in indices), part_item_keys
+    markers, damaged = draft.sound_markers(parts)
+    tasks: list[PartTask] = []
+    total, reused = len(items), 0
+    for part_key, (group, part_items, part_item_keys) in parts.items():
+        marker = markers[part_key]
+        if marker is not None and marker["items"] == [item.id for item in part_items]:
             reused += len(part_items)
+            state.add_rejects(Counter(reject["reason"] for reject in marker["rejects"]))
             continue
         reuse = {
             item.id: donors[item_key] for item, item_key in zip(part_items, part_item_keys, strict=True) if item_key in donors
@@ -337,16 +423,25 @@ def _run_map(
             )
         )  # fmt: skip
     if not forced:
-        tasks = [task for task in tasks if not _link_whole(task, store, draft)]
+        sources: dict[Path, _Source] = {}
+        tasks = [task for task in tasks if not _link_whole(task, sources, draft)]
     label = _label(system, planned.name)
+    if damaged:
+        out(f"{label} {damaged} finished part(s) of the interrupted run are damaged and made again")
     out(f"{label} running    {total} items" + (f", {reused} of them already there" if reused else ""))
     progress = Progress(f"{label}", total, reused)
-    failed: list[tuple[str, str]] = []
+    failed: list[tuple[str, str, Path]] = []
     fresh = {task.part_key: len(task.items) - len(task.reuse) for task in tasks}
+    state.update(now=True, parts=len(parts), total=total, reused=reused, done=reused)
 
     def on_result(result: PartResult) -> None:
-        failed.extend(result.failed)
-        progress.add(fresh[result.part_key] if not result.failed else 0, result.rejects)
+        log = log_file(draft.path, result.part_key)
+        for item, trace in result.failed:
+            failed.append((item, trace, log))
+            state.add_failure(item, trace, log)
+        progress.add(fresh[result.part_key] if not result.failed else 0, sum(result.rejects.values()))
+        state.add_rejects(result.rejects)
+        state.update(now=bool(result.failed), done=progress.done)
 
     limits = parse(Limits, {**stage.limits, **config.limits}, f"{planned.name}.limits")
     workers = config.workers if config.workers is not None else run.workers
@@ -357,24 +452,34 @@ def _run_map(
     workers = min(workers, len(tasks)) if workers else 0
     if tasks:
         try:
-            run_parts(tasks, workers, max(1, cores // max(workers, 1)), limits, on_result, progress.log)
+            if cluster is not None:
+                cluster.run_parts(tasks, limits, on_result, progress.log)
+            else:
+                run_parts(tasks, workers, max(1, cores // max(workers, 1)), limits, on_result, progress.log)
         finally:
             progress.close()
     if failed:
-        (draft.logs / "failures.log").write_text("\n".join(f"{item}\n{trace}" for item, trace in failed))
-        item, trace = failed[0]
+        item, trace, log = failed[0]
         last = trace.strip().splitlines()[-1]
-        names = ", ".join(item for item, _ in failed[:8]) + (", ..." if len(failed) > 8 else "")
-        raise UserError(
-            f"{planned.name}: {len(failed)} item(s) failed: {names}. The first: {last}. "
-            f"Tracebacks: {draft.logs / 'failures.log'}. Everything else is kept; run again to continue"
+        names = ", ".join(item for item, _, _ in failed[:8]) + (", ..." if len(failed) > 8 else "")
+        raise ItemsFailed(
+            f"{planned.name}: {len(failed)} item(s) failed: {names}. The first: {last}. Its traceback: {log} "
+            "(`lightmill status` names the others'). Everything else is kept; run again to continue"
         )
-    draft.use_parts([draft.marker(part_key) for part_key in markers])  # type: ignore[misc]
+    draft.use_parts(_finished(planned.name, draft, parts))
     _check_rejects(planned, stage, draft, total)
     for path in sorted(draft.files.rglob("*"), reverse=True):  # what an interrupted finish left
         path.unlink() if path.is_file() else path.rmdir()
     stage.finish(config, inputs, draft)
     stage.check(draft)
+
+
+def _finished(name: str, draft: Draft, part_keys: Iterable[str]) -> Iterator[dict[str, Any]]:
+    for part_key in part_keys:
+        marker = draft.marker(part_key)
+        if marker is None:
+            raise MachineError(f"{name}: finished part {part_key[:12]} vanished from {draft.path}: run again")
+        yield marker
 
 
 def _check_rejects(planned: Planned, stage: MapStage, draft: Draft, total: int) -> None:
@@ -385,46 +490,62 @@ def _check_rejects(planned: Planned, stage: MapStage, draft: Draft, total: int) 
     if total and len(rejects) / total > planned.config.max_reject_share:
         listed = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
         first = rejects[0]
-        raise UserError(
+        raise TooManyRejects(
             f"{planned.name}: {len(rejects)} of {total} items were rejected ({listed}), more than max_reject_share="
             f"{planned.config.max_reject_share:g}. For example {first['item']}: {first['reason']}: {first['detail']}"
         )
 
 
-def _donations(planned: Planned, store: Store, environment: Mapping[str, Any], wanted: set[str]) -> dict[str, Reuse]:
+def _donations(planned: Planned, store: Store, environment: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Reuse]:
     """Item key -> where an earlier artifact of the same stage holds that item."""
     base = base_key(planned)
     found: dict[str, Reuse] = {}
+    wanted: set[str] = set()
     for artifact in store.artifacts(planned.name):
         manifest = artifact.manifest
         if manifest["base_key"] != base or manifest["environment"] != environment:
             continue
-        rows: dict[str, list[Any]] = {}
-        for row in artifact.rows():
-            if row.item_key in wanted:
-                rows.setdefault(row.item_key, []).append(row)
-        found.update({key: Reuse(artifact.path, tuple(group)) for key, group in rows.items()})
+        try:
+            artifact.rows(), artifact.rejects()
+        except Damaged:  # it gives nothing, and is no input of ours
+            continue
+        wanted = wanted or set(keys)
+        for item_key, rows in itertools.groupby(artifact.rows(), key=lambda row: row.item_key):  # an item's rows are neighbours
+            if item_key in wanted:
+                found[item_key] = Reuse(artifact.path, tuple(row.id for row in rows))
         for reject in artifact.rejects():
             if reject.get("item_key") in wanted and not reject.get("machine"):
                 found[reject["item_key"]] = Reuse(reject=reject)
     return found
 
 
-def _link_whole(task: PartTask, store: Store, draft: Draft) -> bool:
+class _Source:
+    """An earlier artifact whose parts may be taken over whole."""
+
+    def __init__(self, path: Path):
+        self.artifact = Artifact(path)
+        self.parts = {part["part_key"]: part for part in self.artifact.manifest["outputs"]["parts"]}
+        self.rejects = {reject["item"]: reject for reject in self.artifact.rejects() if not reject.get("whole")}
+        self.spans: dict[str, list[int]] = {}  # part's digest -> its first row and the one after its last
+        for number, row in enumerate(self.artifact.rows()):
+            self.spans.setdefault(row.part, [number, number])[1] = number + 1
+
+
+def _link_whole(task: PartTask, sources: dict[Path, _Source], draft: Draft) -> bool:
     """Take over the whole part by hard link where one artifact holds exactly these items as one part."""
     if len(task.reuse) < len(task.items):
         return False
-    source = next((reuse.artifact for reuse in task.reuse.values() if reuse.artifact is not None), None)
-    if source is None:
+    path = next((reuse.artifact for reuse in task.reuse.values() if reuse.artifact is not None), None)
+    if path is None:
         return False
-    artifact = Artifact(source)
-    for part in artifact.manifest["outputs"]["parts"]:
-        if part["part_key"] == task.part_key:
-            rejects = [r for r in artifact.rejects() if r["item"] in set(part["items"]) and not r.get("whole")]
-            rows = [row.to_json() for row in artifact.rows() if row.part == part["digest"]]
-            draft.link_part(artifact.part_path(part["digest"]), task.part_key, {**part, "rejects": rejects, "rows": rows})
-            return True
-    return False
+    source = sources.get(path) or sources.setdefault(path, _Source(path))
+    part = source.parts.get(task.part_key)
+    if part is None:
+        return False
+    first, end = source.spans[part["digest"]]
+    rows = [row.to_json() for row in source.artifact.rows()[first:end]]
+    rejects = [source.rejects[item] for item in part["items"] if item in source.rejects]
+    return draft.link_part(source.artifact.part_path(part["digest"]), task.part_key, {**part, "rejects": rejects, "rows": rows})
 
 
 @cache

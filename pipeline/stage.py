@@ -22,7 +22,7 @@ RECORD_ID = re.compile(r"[A-Za-z0-9_-]{1,120}\Z")
 MEMBER_NAME = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Item:
     """One unit of a map stage's work.
 

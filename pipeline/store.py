@@ -13,6 +13,7 @@ run continues.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import os
@@ -22,48 +23,41 @@ import threading
 import time
 import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import psutil
 
-from pipeline.errors import UserError
-from pipeline.files import TarWriter, hash_file, read_jsonl, sync_folder, write_atomic, write_json, write_jsonl
+from pipeline.errors import Damaged, MachineError, UserError
+from pipeline.files import (
+    TarWriter,
+    hash_file,
+    json_line,
+    read_jsonl,
+    read_sealed,
+    sync_folder,
+    write_atomic,
+    write_json,
+    write_jsonl,
+    write_sealed,
+)
 from pipeline.keys import digest_of
+from pipeline.listing import Listing, Row
 from pipeline.stage import Record
 
-SCHEMA = 1
-STALE_CLAIM_S = 120.0  # a claim without a heartbeat for this long is taken over
+SCHEMA = 2  # of manifests; from 2 on they are sealed, so that a changed byte shows
+STALE_CLAIM_S = 120.0  # another host's claim without a heartbeat for this long is taken over
+DRAFT = "draft.json"  # what is being made; stays with the artifact
+WORKING = ("markers", "running", "state")  # folders of a draft that its artifact does not keep
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """Where one record lies: ``members`` maps a member's name to (offset, bytes) in the part's tar."""
-
-    id: str
-    item: str
-    group: str
-    part: str
-    digest: str
-    item_key: str
-    members: Mapping[str, tuple[int, int]]
-
-    def to_json(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__slots__}
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Row:
-        members = {name: (int(offset), int(size)) for name, (offset, size) in data["members"].items()}
-        return cls(data["id"], data["item"], data["group"], data["part"], data["digest"], data["item_key"], members)
-
-
-def record_digest(record: Record) -> str:
+def record_digest(members: Mapping[str, bytes]) -> str:
     """Hex blake2b-256 over the names and bytes of a record's members."""
     digest = hashlib.blake2b(digest_size=32)
-    for name in sorted(record.members):
-        data = record.members[name]
+    for name in sorted(members):
+        data = members[name]
         digest.update(f"{len(name)}:{name}:{len(data)}:".encode())
         digest.update(data)
     return digest.hexdigest()
@@ -74,19 +68,16 @@ class _Records:
 
     path: Path
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> Listing:
+        """All rows, sorted by (group, item)."""
         raise NotImplementedError
 
-    @cached_property
-    def _by_id(self) -> dict[str, Row]:
-        return {row.id: row for row in self.rows()}
-
     def __contains__(self, record_id: str) -> bool:
-        return record_id in self._by_id
+        return self.rows().holds(record_id)
 
     def row(self, record_id: str) -> Row:
         try:
-            return self._by_id[record_id]
+            return self.rows().find(record_id)
         except KeyError:
             raise UserError(f"there is no record {record_id!r} in {self.path}") from None
 
@@ -105,19 +96,30 @@ class _Records:
         return self.part_path(row.part), row.group
 
     def read(self, record_id: str, only: Collection[str] | None = None) -> Record:
-        """One record, or ``only`` these members of it: one open, one seek per member, whatever the part's size."""
+        """One record, or ``only`` these members of it: one open, one seek per member, whatever the part's size.
+
+        A whole record is checked against its digest, so that nothing is made from damaged bytes.
+        """
         row = self.row(record_id)
-        with open(self.part_path(row.part), "rb") as file:
-            members = {}
-            for name, (offset, size) in row.members.items():
-                if only is not None and name not in only:
-                    continue
-                file.seek(offset)
-                data = file.read(size)
-                if len(data) != size:
-                    raise UserError(f"{self.part_path(row.part)} is truncated at {name} of {row.id}: run `lightmill verify`")
-                members[name] = data
-        return Record(row.id, members)
+        path = self.part_path(row.part)
+        try:
+            with open(path, "rb") as file:
+                members = {}
+                for name, (offset, size) in row.members.items():
+                    if only is None or name in only:
+                        file.seek(offset)
+                        members[name] = file.read(size)
+        except FileNotFoundError:
+            raise self.damaged(f"parts/{path.name} is missing") from None
+        record = Record(row.id, members)
+        cut = any(len(data) != row.members[name][1] for name, data in members.items())
+        if cut or (only is None and record_digest(members) != row.digest):
+            raise self.damaged(f"parts/{path.name} is {'cut off' if cut else 'changed'} at record {row.id}")
+        return record
+
+    def damaged(self, what: str) -> Damaged:
+        """The error that says what is damaged and what to do."""
+        return Damaged(f"{self.path}: {what}; `lightmill repair {self.path.parent.name}/{self.path.name}` makes it anew")
 
 
 class Artifact(_Records):
@@ -135,9 +137,9 @@ class Artifact(_Records):
     @cached_property
     def manifest(self) -> dict[str, Any]:
         try:
-            return json.loads((self.path / "manifest.json").read_bytes())
+            return read_sealed(self.path / "manifest.json", SCHEMA)
         except (OSError, ValueError) as error:
-            raise UserError(f"{self.path}/manifest.json cannot be read ({error}): delete the folder and run again") from None
+            raise self.damaged(f"manifest.json cannot be used ({error})") from None
 
     @property
     def key(self) -> str:
@@ -151,16 +153,21 @@ class Artifact(_Records):
     def digest(self) -> str:
         return self.manifest["outputs"]["digest"]
 
-    @cached_property
-    def _rows(self) -> list[Row]:
-        return [Row.from_json(row) for row in read_jsonl(self.path / "items.jsonl")]
+    def _sound(self, name: str) -> Path:
+        path = self.path / name
+        if not path.is_file() or hash_file(path) != self.manifest["outputs"]["listings"][name]:
+            raise self.damaged(f"{name} is missing or changed")
+        return path
 
-    def rows(self) -> list[Row]:
-        """All rows, sorted by (group, item)."""
+    @cached_property
+    def _rows(self) -> Listing:
+        return Listing(self._sound("items.jsonl"))
+
+    def rows(self) -> Listing:
         return self._rows
 
     def rejects(self) -> list[dict[str, Any]]:
-        return read_jsonl(self.path / "rejects.jsonl")
+        return read_jsonl(self._sound("rejects.jsonl"))
 
     def file(self, name: str) -> Path:
         """Path of ``files/<name>``."""
@@ -172,7 +179,10 @@ class Artifact(_Records):
     def verify(self, deep: bool = False) -> list[str]:
         """What is wrong with it, as lines; ``deep`` reads every byte. Empty means sound."""
         problems = []
-        outputs = self.manifest["outputs"]
+        try:
+            outputs = self.manifest["outputs"]
+        except Damaged as error:
+            return [str(error).removeprefix(f"{self.path}: ").partition(";")[0]]
         for part in outputs["parts"]:
             path = self.part_path(part["digest"])
             if not path.is_file():
@@ -193,49 +203,101 @@ class Artifact(_Records):
                 problems.append(f"{name} is missing or changed")
         if digest_of(self.manifest["preimage"]) != self.key:
             problems.append("manifest.json: the key is not the hash of its preimage")
+        if self.manifest.get("schema", 1) > 1 and read_draft(self.path) is None:
+            problems.append(f"{DRAFT}, from which a damaged manifest could be repaired, is missing or changed itself")
         return problems
 
 
+def read_draft(folder: Path) -> dict[str, Any] | None:
+    """What is, or was, being made in the folder: key, preimage, system, config, environment. None if missing or damaged."""
+    try:
+        return read_sealed(folder / DRAFT)
+    except (OSError, ValueError):
+        return None
+
+
 class Claim:
-    """An advisory lock: host, pid and a heartbeat. Losing one wastes work, never corrupts."""
+    """Who works on a draft: a file with host and pid, held by a kernel lock that ends with its process, however that ends.
+
+    Where locks do not reach other hosts, a heartbeat (the file's time) stands in for them. Losing a claim wastes work, never
+    corrupts: the commit does not rely on it.
+    """
 
     def __init__(self, path: Path):
         self.path = path
+        self._handle: int | None = None
         self._stop = threading.Event()
-        self._me = {"host": socket.gethostname(), "pid": os.getpid(), "started": psutil.Process().create_time()}
 
     def holder(self) -> dict[str, Any] | None:
-        """Who holds it, if that process still lives (as far as can be told)."""
+        """Host, pid and start time of who holds it now; None if nobody does."""
         try:
-            other = json.loads(self.path.read_bytes())
-            age = time.time() - self.path.stat().st_mtime
-        except (OSError, ValueError):
+            handle = os.open(self.path, os.O_RDONLY)
+        except OSError:
             return None
-        if other == self._me:
-            return None
-        if other["host"] == self._me["host"]:
-            try:
-                alive = abs(psutil.Process(other["pid"]).create_time() - other["started"]) < 1.0
-            except psutil.Error:
-                alive = False
-            return other if alive else None
-        return other if age < STALE_CLAIM_S else None
+        try:
+            return self._other(handle, fcntl.LOCK_SH)
+        finally:
+            os.close(handle)
 
-    def take(self) -> None:
-        write_json(self.path, self._me)
+    @staticmethod
+    def _other(handle: int, lock: int) -> dict[str, Any] | None:
+        """Who else holds the open claim file; where nobody does it is locked now."""
+        locked, free = False, True
+        try:
+            fcntl.flock(handle, lock | fcntl.LOCK_NB)
+            locked = True
+        except BlockingIOError:
+            free = False
+        except OSError:  # a file system without locks
+            pass
+        try:
+            other = json.loads(os.pread(handle, 4096, 0))
+        except ValueError:
+            other = None if free else {"host": "?", "pid": 0}
+        if other is None or not free:
+            return other
+        if other["host"] == socket.gethostname():
+            return None if locked or not psutil.pid_exists(other["pid"]) or other["pid"] == os.getpid() else other
+        return other if abs(time.time() - os.fstat(handle).st_mtime) < STALE_CLAIM_S else None
+
+    def take(self) -> bool:
+        """Take it unless another process holds it."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            if self._other(handle, fcntl.LOCK_EX) is not None:
+                return False
+            if not self._is_at_path(handle):  # its last holder has just let go of it, and of its name
+                return False
+            me = {"host": socket.gethostname(), "pid": os.getpid(), "since": time.time()}
+            os.truncate(handle, 0)
+            os.pwrite(handle, json.dumps(me).encode(), 0)
+            self._handle, handle = handle, -1
+        finally:
+            if handle >= 0:
+                os.close(handle)
 
         def beat() -> None:
             while not self._stop.wait(STALE_CLAIM_S / 8):
-                try:
+                with contextlib.suppress(OSError):
                     os.utime(self.path)
-                except OSError:
-                    return
 
         threading.Thread(target=beat, daemon=True).start()
+        return True
+
+    def _is_at_path(self, handle: int) -> bool:
+        try:
+            return os.path.samestat(os.stat(self.path), os.fstat(handle))
+        except FileNotFoundError:
+            return False
 
     def release(self) -> None:
         self._stop.set()
-        self.path.unlink(missing_ok=True)
+        if self._handle is not None:
+            if self._is_at_path(self._handle):
+                self.path.unlink(missing_ok=True)
+            os.close(self._handle)
+            self._handle = None
 
 
 class Draft(_Records):
@@ -268,14 +330,19 @@ class Draft(_Records):
         """Reject an item for what only the whole artifact shows (a duplicate, say). Its record stays in the parts."""
         self._whole_rejects.append({"item": item, "group": "", "reason": reason, "detail": detail, "whole": True})
 
+    def sweep(self) -> None:
+        """Delete what workers that were killed left half written. Only for who holds the claim."""
+        for pattern in ("parts/.*.tmp", "markers/.*.tmp", ".*.tmp", "running/*"):
+            for path in self.path.glob(pattern):
+                path.unlink(missing_ok=True)
+
     # -- environment: runtime choices that one artifact must not mix
 
     def environment(self) -> dict[str, Any] | None:
-        path = self.path / "environment.json"
-        return json.loads(path.read_bytes()) if path.is_file() else None
+        return (read_draft(self.path) or {}).get("environment")
 
     def set_environment(self, environment: Mapping[str, Any]) -> None:
-        write_json(self.path / "environment.json", environment)
+        write_sealed(self.path / DRAFT, {**(read_draft(self.path) or {}), "environment": environment})
 
     # -- parts
 
@@ -283,23 +350,46 @@ class Draft(_Records):
         """The finished part of that key, or None; a marker whose file is missing or cut does not count."""
         path = self.path / "markers" / f"{part_key}.json"
         try:
-            marker = json.loads(path.read_bytes())
+            marker = read_sealed(path)
             if marker["digest"] is not None and self.part_path(marker["digest"]).stat().st_size != marker["bytes"]:
                 return None
             return marker
         except (OSError, ValueError):
             return None
 
+    def sound_markers(self, part_keys: Collection[str]) -> tuple[dict[str, dict[str, Any] | None], int]:
+        """Part key -> marker (less its rows) or None, with every byte read; and how many parts turned out damaged.
+
+        What an interrupted run left may have lain for weeks; hashing runs at the disk's speed, computing again does not.
+        """
+
+        def check(part_key: str) -> tuple[dict[str, Any] | None, bool]:
+            marker = self.marker(part_key)
+            if marker is not None:
+                del marker["rows"]  # there may be millions
+            if marker is None or marker["digest"] is None or hash_file(self.part_path(marker["digest"])) == marker["digest"]:
+                return marker, False
+            return None, True
+
+        with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as threads:
+            found = dict(zip(part_keys, threads.map(check, part_keys), strict=True))
+        return {key: marker for key, (marker, _) in found.items()}, sum(damaged for _, damaged in found.values())
+
     def finish_part(self, part_key: str, marker: Mapping[str, Any]) -> None:
-        write_json(self.path / "markers" / f"{part_key}.json", marker)
+        write_sealed(self.path / "markers" / f"{part_key}.json", marker)
 
     def open_part(self) -> PartWriter:
         return PartWriter(self)
 
-    def link_part(self, source: Path, part_key: str, marker: Mapping[str, Any]) -> None:
-        """Take over a finished part of an earlier artifact by hard link (a copy where links are not possible)."""
+    def link_part(self, source: Path, part_key: str, marker: Mapping[str, Any]) -> bool:
+        """Take over a finished part of an earlier artifact by hard link (a copy where links are not possible).
+
+        Returns False, and takes nothing, where the source is damaged.
+        """
         if marker["digest"] is not None:
             target = self.part_path(marker["digest"])
+            if not source.is_file() or hash_file(source) != marker["digest"]:
+                return False
             if not target.exists():
                 temporary = target.with_name(f".{uuid.uuid4().hex[:8]}.tmp")
                 try:
@@ -308,19 +398,30 @@ class Draft(_Records):
                     shutil.copyfile(source, temporary)
                 os.replace(temporary, target)
         self.finish_part(part_key, marker)
+        return True
 
     def use_parts(self, markers: Iterable[Mapping[str, Any]]) -> None:
-        """The markers, in order, that make up the artifact: from here on rows and rejects can be read."""
-        self._markers = list(markers)
-        self._rows = [Row.from_json(row) for marker in self._markers for row in marker["rows"]]
-        self.__dict__.pop("_by_id", None)
-        seen: dict[str, str] = {}
-        for row in self._rows:
-            if row.id in seen:
-                raise UserError(f"items {seen[row.id]!r} and {row.item!r} both made a record {row.id!r}")
-            seen[row.id] = row.item
+        """The markers, in order, that make up the artifact: from here on rows and rejects can be read.
 
-    def rows(self) -> list[Row]:
+        Rows go to ``items.jsonl`` as the markers come; only what the manifest says of a part is kept in memory.
+        """
+        self._markers: list[dict[str, Any]] = []
+        makers: dict[str, str] = {}
+
+        def lines() -> Iterator[bytes]:
+            for marker in markers:
+                self._markers.append({name: value for name, value in marker.items() if name != "rows"})
+                for row in marker["rows"]:
+                    record, item = row["id"], row["item"]
+                    if record in makers:
+                        raise UserError(f"items {makers[record]!r} and {item!r} both made a record {record!r}")
+                    makers[record] = record if record == item else item  # one string of the two
+                    yield json_line(row)
+
+        write_atomic(self.path / "items.jsonl", lines())
+        self._rows = Listing(self.path / "items.jsonl")
+
+    def rows(self) -> Listing:
         return self._rows
 
     def rejects(self) -> list[dict[str, Any]]:
@@ -330,7 +431,6 @@ class Draft(_Records):
 
     def outputs(self, products: Iterable[str] = ()) -> dict[str, Any]:
         """The manifest's ``outputs``: parts, items, rejects, bytes, and the digest over records and products."""
-        write_jsonl(self.path / "items.jsonl", (row.to_json() for row in self._rows))
         rejects = self.rejects()
         write_jsonl(self.path / "rejects.jsonl", rejects)
         parts = [
@@ -382,7 +482,7 @@ class PartWriter:
 
     def add(self, record: Record, item: str, group: str, item_key: str) -> None:
         members = {name: (self._tar.add(f"{record.id}.{name}", data), len(data)) for name, data in record.members.items()}
-        self._rows.append(Row(record.id, item, group, "", record_digest(record), item_key, members).to_json())
+        self._rows.append(Row(record.id, item, group, "", record_digest(record.members), item_key, members).to_json())
 
     def close(self) -> dict[str, Any]:
         """Flush, rename; returns the marker's ``digest``, ``bytes`` and ``rows``. A part without records has no file."""
@@ -400,7 +500,8 @@ class PartWriter:
         return {"digest": digest, "bytes": self._tar.size, "rows": self._rows}
 
     def discard(self) -> None:
-        self._file.close()
+        with contextlib.suppress(OSError):  # closing flushes, and the disk may be full
+            self._file.close()
         self._path.unlink(missing_ok=True)
 
 
@@ -412,17 +513,28 @@ class Store:
 
     # -- finding
 
+    def folder(self, stage: str, key: str) -> Path | None:
+        """The folder of the committed artifact, sound or damaged."""
+        return next(iter((self.root / stage).glob(f"*-{key[:12]}")), None)
+
     def find(self, stage: str, key: str) -> Artifact | None:
-        for path in (self.root / stage).glob(f"*-{key[:12]}"):
-            if (path / "manifest.json").is_file() and Artifact(path).key == key:
-                return Artifact(path)
-        return None
+        """The committed artifact; an error where its manifest is damaged."""
+        path = self.folder(stage, key)
+        return Artifact(path) if path is not None and Artifact(path).key == key else None
 
     def artifacts(self, stage: str | None = None) -> list[Artifact]:
-        """All committed artifacts, oldest first."""
-        found = [Artifact(path.parent) for path in self.root.glob(f"{stage or '[!.]*'}/[!.]*/manifest.json")]
-        found = [artifact for artifact in found if not artifact.path.name.endswith(".partial")]
-        return sorted(found, key=lambda artifact: (artifact.manifest["finished"], str(artifact.path)))
+        """All committed artifacts whose manifests can be read, oldest first."""
+        found = []
+        for path in self.folders(stage):
+            with contextlib.suppress(Damaged):
+                artifact = Artifact(path)
+                found.append((artifact.manifest["finished"], str(path), artifact))
+        return [artifact for _, _, artifact in sorted(found, key=lambda entry: entry[:2])]
+
+    def folders(self, stage: str | None = None) -> list[Path]:
+        """The folders of all committed artifacts, sound or damaged."""
+        found = self.root.glob(f"{stage or '[!.]*'}/[!.]*-" + "[0-9a-f]" * 12)
+        return sorted(path for path in found if (path / "manifest.json").exists() or (path / DRAFT).exists())
 
     def drafts(self) -> list[Path]:
         return sorted(self.root.glob("[!.]*/*.partial"))
@@ -430,10 +542,9 @@ class Store:
     def resolve(self, reference: str) -> Artifact:
         """The artifact that a person means: a key or its beginning, ``stage/folder``, a folder, or a stage's newest."""
         path = Path(reference)
-        if (path / "manifest.json").is_file():
-            return Artifact(path)
-        if (self.root / reference / "manifest.json").is_file() and ".." not in path.parts:
-            return Artifact(self.root / reference)
+        for folder in (path, self.root / reference if ".." not in path.parts else path):
+            if (folder / "manifest.json").is_file() or ((folder / DRAFT).is_file() and folder.suffix != ".partial"):
+                return Artifact(folder)
         stage, _, rest = reference.rpartition("/")
         if not stage and (newest := self.artifacts(reference) if reference.isidentifier() else []):
             return newest[-1]
@@ -447,16 +558,18 @@ class Store:
 
     # -- making
 
-    def draft(self, stage: str, key: str, preimage: Mapping[str, Any], out: Any = print) -> Draft:
-        """A new draft, or the one that an interrupted run left."""
-        path = self.root / stage / f"{key}.partial"
-        try:
-            draft = Draft(path, stage, key, preimage, out)
-        except OSError as error:
-            raise UserError(f"cannot write to the store at {self.root}: {error.strerror} ({error.filename})") from None
-        if not (path / "draft.json").is_file():
-            write_json(path / "draft.json", {"key": key, "preimage": draft.preimage, "started": time.time()})
+    def draft(
+        self, stage: str, key: str, preimage: Mapping[str, Any], out: Any = print, origin: Mapping[str, Any] | None = None
+    ) -> Draft:
+        """A new draft, or the one that an interrupted run left. ``origin``: what it takes to make it anew (system, config)."""
+        path = self.draft_path(stage, key)
+        draft = Draft(path, stage, key, preimage, out)
+        if read_draft(path) is None:
+            write_sealed(path / DRAFT, {"key": key, "preimage": draft.preimage, "started": time.time(), **(origin or {})})
         return draft
+
+    def draft_path(self, stage: str, key: str) -> Path:
+        return self.root / stage / f"{key}.partial"
 
     def claim(self, stage: str, key: str) -> Claim:
         return Claim(self.root / stage / f".{key}.claim")
@@ -470,25 +583,28 @@ class Store:
         for path in (draft.path / "parts").iterdir():
             if path.suffix != ".tar" or path.stem not in used:
                 path.unlink()  # orphans: temporaries of killed workers, parts of another plan
-        write_json(draft.path / "manifest.json", manifest)
+        write_sealed(draft.path / "manifest.json", manifest)
         for folder in ("parts", "files", "."):
             sync_folder(draft.path / folder)
-        target = self.root / draft.stage / f"{slug}-{draft.key[:12]}"
-        existing = self.find(draft.stage, draft.key)
-        if existing is not None and not replace and not existing.verify():
+        problems = Artifact(draft.path).verify()
+        if problems:  # somebody else is at work in the same draft after all
+            raise MachineError(f"{draft.path} changed while it was being committed ({problems[0]}): run the same command again")
+        old = self.folder(draft.stage, draft.key)
+        if old is not None and not replace and not Artifact(old).verify():
             shutil.rmtree(draft.path)
+            target = old
         else:
-            if existing is not None:
+            target = self.root / draft.stage / f"{slug}-{draft.key[:12]}"
+            if old is not None:
                 trash = self.root / ".trash"
                 trash.mkdir(exist_ok=True)
-                os.replace(existing.path, trash / f"{draft.stage}-{existing.path.name}-{uuid.uuid4().hex[:8]}")
+                os.replace(old, trash / f"{draft.stage}-{old.name}-{uuid.uuid4().hex[:8]}")
             os.replace(draft.path, target)
             sync_folder(target.parent)
-            existing = Artifact(target)
-            for folder in ("markers", "running", "state"):  # only now: until the rename they are what a resume needs
+            for folder in WORKING:  # only now: until the rename they are what a resume needs
                 shutil.rmtree(target / folder, ignore_errors=True)
-        self.touch(existing.key)
-        return existing
+        self.touch(draft.key)
+        return Artifact(target)
 
     # -- use, pins, garbage
 
@@ -535,7 +651,7 @@ class Store:
         for artifact in artifacts:
             found += [
                 (artifact.path / name, "left over by a commit that was interrupted")
-                for name in ("markers", "running", "state")
+                for name in WORKING
                 if artifact.key in keep and (artifact.path / name).exists()
             ]
         return found

@@ -1,7 +1,8 @@
 """Making one part, in whatever process the executor chose.
 
 Before each item the worker announces it in ``running/<part>.json``, so that the runner can hold the item to its limits and
-knows which one was at work when a process died.
+knows which one was at work when a process died. ``logs/<part>.log`` says what became of each item, how long it took and what
+libraries printed; it stays with the artifact, outside its digest.
 """
 
 from __future__ import annotations
@@ -9,31 +10,41 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
+import multiprocessing
 import os
 import signal
+import socket
 import sys
 import time
 import traceback
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import Reject, UserError
+from pipeline.errors import STORAGE_ERRORS, Damaged, Reject, UserError
 from pipeline.stage import Item, MapStage, Record, load_system
-from pipeline.store import Artifact, Draft, Row
+from pipeline.store import Artifact, Draft
 
 THREADS_VARIABLE = "LIGHTMILL_THREADS"  # what a stage may use in a worker; also set as OMP_NUM_THREADS and its like
 _opened: dict[tuple[str, str], tuple[MapStage, Any]] = {}  # (stage, key) -> the stage and its worker, once per process
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Reuse:
-    """An item taken over from an earlier artifact: its records' rows there, or its reject."""
+    """An item taken over from an earlier artifact: the ids of its records there, or its reject."""
 
     artifact: Path | None = None
-    rows: tuple[Row, ...] = ()
+    records: tuple[str, ...] = ()
     reject: Mapping[str, Any] | None = None
+
+
+@lru_cache(maxsize=4)
+def _artifact(path: Path) -> Artifact:
+    """Opened once per process: its listing may be long."""
+    return Artifact(path)
 
 
 @dataclass(frozen=True)
@@ -58,23 +69,44 @@ class PartTask:
 
 @dataclass(frozen=True)
 class PartResult:
-    """What the runner hears of a part; ``failed`` holds (item id, traceback) of ordinary exceptions."""
+    """What the runner hears of a part: rejects by reason; ``failed`` holds (item id, traceback) of ordinary exceptions."""
 
     part_key: str
     done: int
-    rejects: int
+    rejects: Mapping[str, int] = field(default_factory=dict)
     failed: tuple[tuple[str, str], ...] = ()
 
 
 def die_with_parent() -> None:
-    """Ask Linux to kill this process when its parent dies, so that a killed run leaves nobody working."""
+    """Ask Linux to kill this process when its parent dies, so that a killed run leaves nobody working.
+
+    And before its parent when memory runs out: a worker costs an item's second try, the runner the run.
+    """
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+    parent = multiprocessing.parent_process()
+    if parent is not None and os.getppid() != parent.pid:  # it died before the line above
+        os._exit(1)
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("500")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the runner's business
 
 
 def running_file(draft: Path, part_key: str) -> Path:
     return draft / "running" / f"{part_key}.json"
+
+
+def log_file(draft: Path, part_key: str) -> Path:
+    return draft / "logs" / f"{part_key[:16]}.log"
+
+
+def write_log(draft: Path, part_key: str, text: str) -> None:
+    """A line in the part's log, with the time of day."""
+    handle = os.open(log_file(draft, part_key), os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    try:
+        os.write(handle, f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n".encode())
+    finally:
+        os.close(handle)
 
 
 @contextlib.contextmanager
@@ -89,40 +121,46 @@ def _output_to(path: Path) -> Iterator[None]:
         os.dup2(target, 2)
         yield
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        with contextlib.suppress(OSError):  # a full disk loses what was printed, no more
+            sys.stdout.flush()
+            sys.stderr.flush()
         for number, copy in zip((1, 2), saved, strict=True):
             os.dup2(copy, number)
             os.close(copy)
         os.close(target)
-        if path.stat().st_size == 0:
-            path.unlink()
 
 
 def _announce(task: PartTask, item: str) -> None:
     times = os.times()
     path = running_file(task.draft, task.part_key)
     temporary = path.with_suffix(f".{os.getpid()}")
-    state = {"pid": os.getpid(), "item": item, "cpu_s": times.user + times.system, "time": time.time()}
-    temporary.write_text(json.dumps(state))
+    # ``time`` is for people; limits go by ``monotonic``, which no change of the clock moves
+    state = {"pid": os.getpid(), "item": item, "cpu_s": times.user + times.system}
+    temporary.write_text(json.dumps({**state, "time": time.time(), "monotonic": time.monotonic()}))
     os.replace(temporary, path)
 
 
 def run_part(task: PartTask, log: bool = True) -> PartResult:
-    """Make the part: write its tar and its marker into the draft. An exception in an item fails the part."""
-    with _output_to(task.draft / "logs" / f"{task.part_key[:16]}.log") if log else contextlib.nullcontext():
+    """Make the part: write its tar and its marker into the draft. An exception in an item fails the part.
+
+    ``log``: what this process prints meanwhile goes to the part's log.
+    """
+    draft = Draft(task.draft, task.stage, task.key, {})
+    with _output_to(log_file(task.draft, task.part_key)) if log else contextlib.nullcontext():
         try:
-            return _run_part(task)
+            return _run_part(task, draft)
         finally:
             running_file(task.draft, task.part_key).unlink(missing_ok=True)
 
 
-def _run_part(task: PartTask) -> PartResult:
-    draft = Draft(task.draft, task.stage, task.key, {})
-    writer = draft.open_part()
-    rejects: list[dict[str, Any]] = []
-    failed: list[tuple[str, str]] = []
-    early: dict[str, list[Record] | Reject] = {}
+@dataclass(frozen=True)
+class _Failure:
+    trace: str
+
+
+def _run_part(task: PartTask, draft: Draft) -> PartResult:
+    def say(text: str) -> None:
+        write_log(task.draft, task.part_key, text)
 
     def compute(item: Item) -> list[Record] | Reject:
         _announce(task, item.id)
@@ -137,38 +175,58 @@ def _run_part(task: PartTask) -> PartResult:
             raise AssertionError(f"{task.stage} made no record of item {item.id!r} and did not reject it")
         return records
 
+    def taken_over(reuse: Reuse, item: Item) -> list[Record] | Reject:
+        try:
+            return [_artifact(reuse.artifact).read(record) for record in reuse.records]
+        except Damaged as error:  # of an artifact that this one does not depend on
+            say(f"{item.id}: not taken over: {error}")
+            return compute(item)
+
+    def attempt(item: Item) -> list[Record] | Reject | _Failure:
+        began = time.monotonic()
+        reuse = task.reuse.get(item.id)
+        try:
+            if reuse is None:
+                result = compute(item)
+            elif reuse.reject is not None:
+                result = Reject(reuse.reject["reason"], reuse.reject["detail"])
+            else:
+                result = taken_over(reuse, item)
+        except UserError:
+            raise
+        except Exception as error:
+            if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
+                raise
+            result = _Failure(traceback.format_exc())
+        what = f"{len(result)} record(s)" if isinstance(result, list) else f"rejected, {result}"
+        if isinstance(result, _Failure):
+            what = f"FAILED\n{result.trace.rstrip()}"
+        where = "" if reuse is None else ", taken over" + (f" from {reuse.artifact.name}" if reuse.artifact else "")
+        say(f"{item.id}: {time.monotonic() - began:.3f} s, {what}{where}")
+        return result
+
+    say(f"{len(task.items)} items of {task.stage} {task.group or '-'}: process {os.getpid()} on {socket.gethostname()}")
+    writer = draft.open_part()
+    rejects: list[dict[str, Any]] = []
+    failed: list[tuple[str, str]] = []
     try:
-        for item in task.items:
-            if item.id == task.first:
-                early[item.id] = compute(item)
+        early = {item.id: attempt(item) for item in task.items if item.id == task.first}
         for item, item_key in zip(task.items, task.item_keys, strict=True):
             row = {"item": item.id, "group": item.group, "item_key": item_key}
             if item.id in task.killed:
                 rejects.append({**row, **task.killed[item.id]})
                 continue
-            reuse = task.reuse.get(item.id)
-            if reuse is not None and reuse.reject is not None:
-                rejects.append({**row, "reason": reuse.reject["reason"], "detail": reuse.reject["detail"]})
-                continue
-            try:
-                if reuse is not None:
-                    artifact = Artifact(reuse.artifact)
-                    result: list[Record] | Reject = [artifact.read(source.id) for source in reuse.rows]
-                else:
-                    result = early.pop(item.id) if item.id in early else compute(item)
-            except UserError:
-                raise
-            except Exception:
-                failed.append((item.id, traceback.format_exc()))
-                continue
-            if isinstance(result, Reject):
+            result = early.pop(item.id) if item.id in early else attempt(item)
+            if isinstance(result, _Failure):
+                failed.append((item.id, result.trace))
+            elif isinstance(result, Reject):
                 rejects.append({**row, "reason": result.reason, "detail": result.detail})
-                continue
-            for record in result:
-                writer.add(record, item.id, item.group, item_key)
+            else:
+                for record in result:
+                    writer.add(record, item.id, item.group, item_key)
         if failed:
             writer.discard()
-            return PartResult(task.part_key, 0, 0, tuple(failed))
+            return PartResult(task.part_key, 0, failed=tuple(failed))
         marker = {
             **writer.close(),
             "part_key": task.part_key,
@@ -177,7 +235,8 @@ def _run_part(task: PartTask) -> PartResult:
             "rejects": rejects,
         }
         draft.finish_part(task.part_key, marker)
-        return PartResult(task.part_key, len(task.items), len(rejects))
+        say(f"finished: {len(marker['rows'])} records, {len(rejects)} rejects, {marker['bytes']} bytes")
+        return PartResult(task.part_key, len(task.items), Counter(reject["reason"] for reject in rejects))
     except BaseException:
         writer.discard()
         raise
@@ -195,3 +254,4 @@ def _open(task: PartTask) -> tuple[MapStage, Any]:
 def close_workers() -> None:
     """Drop what this process opened: a run in the caller's own process leaves nothing behind."""
     _opened.clear()
+    _artifact.cache_clear()

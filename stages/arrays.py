@@ -18,9 +18,12 @@ def pack_arrays(arrays: dict[str, np.ndarray], compressed: bool = False) -> byte
 
 
 def unpack_arrays(data: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an ``.npz``; pickled objects are refused."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
+    """The arrays of an ``.npz``; pickled objects and sizes that no memory holds are refused (ValueError)."""
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except MemoryError as error:
+        raise ValueError(f"arrays of an absurd size: {error}") from None
 
 
 def pack_json(value: Any) -> bytes:

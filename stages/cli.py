@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.commands import add_commands
-from pipeline.errors import UserError
+from pipeline.errors import INTERRUPTED, UserError, status_of
 
 PROGRAM = "lightmill"
 
@@ -189,7 +189,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Returns the exit status: 0, 1 for what a check found, 2 for an error that the user can mend."""
+    """Returns the exit status: 0, or that of the error (see pipeline.errors)."""
     arguments, unknown = build_parser().parse_known_args(words)
     if arguments.function in (command_run, command_import):
         arguments.words = unknown  # overrides and Hydra's own flags, in any order
@@ -204,9 +204,9 @@ def main(words: Sequence[str] | None = None) -> int:
         if arguments.debug:
             raise
         print(f"error: {error}", file=sys.stderr)
-        return 2
+        return status_of(error)
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import io
 import re
+import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -24,6 +25,7 @@ from stages.records import ViewRecord
 HALF_MAX = 65504.0  # largest finite half float
 FLOATS = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)  # the float32 of every half float, by its bits
 MAX_SIDE = 16384  # pixels; what a header may claim
+MAX_BYTES = 2**32  # of all channels together, uncompressed
 META = "lightmill"  # header attribute
 
 
@@ -60,12 +62,32 @@ def _decode(data: bytes, where: str) -> tuple[dict, dict[str, np.ndarray]]:
     import OpenEXR
 
     OpenEXR.setMaxImageSize(MAX_SIDE, MAX_SIDE)
+    claimed = claimed_bytes(data)
+    if claimed > MAX_BYTES:
+        raise UserError(f"{where} claims to hold up to {claimed:,} bytes of pixels, more than {MAX_BYTES:,}")
     try:
         with OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0) as file:
             return dict(file.header()), {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, TypeError, OSError, MemoryError) as error:
         detail = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(f"{where} is not an OpenEXR image that can be read ({detail})") from error
+
+
+WINDOW, CHANNELS = (
+    re.compile(rb"dataWindow\0box2i\0.{4}(.{16})", re.DOTALL),
+    re.compile(rb"channels\0chlist\0(.{4})", re.DOTALL),
+)
+CHANNEL_BYTES = 18  # of the shortest entry in a list of channels
+
+
+def claimed_bytes(data: bytes) -> int:
+    """An upper bound of what the headers make the library allocate: it does so before it looks for the pixels.
+
+    All that looks like a size or a list of channels counts, so that nothing can hide one.
+    """
+    sizes = [struct.unpack("<4i", match[1]) for match in WINDOW.finditer(data)]
+    pixels = max((max(right - left + 1, 0) * max(low - top + 1, 0) for left, top, right, low in sizes), default=0)
+    return 4 * pixels * sum(struct.unpack("<I", match[1])[0] // CHANNEL_BYTES for match in CHANNELS.finditer(data))
 
 
 def _half(pixels: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
+from pipeline.stage import RECORD_ID
 from stages.records import PATCH_CHANNELS, PATCH_KEPT, PATCH_NORMAL, TEXTURED_CHANNELS, SceneRecord
 
 
@@ -57,6 +58,8 @@ def export(source: Any, out: Path, splits: list[str] | None = None, images: bool
 
     present = sorted(json.loads(open_source(source).path(f"files/{SHARDS}").read_bytes()))
     for split in splits or present:
+        if not RECORD_ID.match(split):  # a folder is named after it
+            raise UserError(f"{split!r} is no name of a split")
         dataset = ShardDataset(source, split, cache_mb=0)
         (out / split).mkdir(parents=True, exist_ok=True)
         for index, id in enumerate(dataset.ids):
@@ -64,5 +67,5 @@ def export(source: Any, out: Path, splits: list[str] | None = None, images: bool
             path = out / split / f"{id}.h5"
             write_hdf5(path, sample.scene)
             for camera, view in sample.views.items():
-                (out / split / f"{id}-view{camera}.exr").write_bytes(encode_rgb(view.image))
+                (out / split / f"{id}-view{int(camera)}.exr").write_bytes(encode_rgb(view.image))
             yield path

@@ -24,6 +24,9 @@ from stages.records import PATCH_CHANNELS, PATCH_KEPT, PATCH_SIDE, TEXTURED_CHAN
 CREASE_DEG = 30.0
 MIN_ROUGHNESS = 0.01
 FORMATS = ".json, .h5 or .hdf5"
+MAX_JSON_BYTES = 2**26
+MAX_MESH_BYTES, MAX_MESH_FACES = 2**28, 4_000_000  # of one mesh file that a JSON scene names
+MAX_DATASET_BYTES = 2**31  # of one dataset of an HDF5 file, uncompressed
 
 
 def load_scene(path: Path | str) -> SceneRecord:
@@ -47,8 +50,12 @@ def load_scene(path: Path | str) -> SceneRecord:
 def load_json(path: Path) -> SceneRecord:
     """A scene in the released JSON format."""
     try:
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise UserError(f"{path} has {path.stat().st_size:,} bytes: scenes of at most {MAX_JSON_BYTES:,} are read")
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
+    except UserError:
+        raise
+    except (ValueError, OSError, RecursionError) as error:
         raise UserError(f"{path} is not JSON: {error}") from error
     if not isinstance(data, dict) or not isinstance(data.get("objects"), dict) or not data["objects"]:
         raise UserError(f"{path} has no objects: expected objects {{name: {{mesh_path, material, transform}}}} and cameras")
@@ -127,6 +134,8 @@ def _mesh(folder: Path, entry: dict[str, Any], smooth: bool, where: str) -> tupl
     """Transformed triangles (F, 3, 3), unit corner normals (F, 3, 3), and the shading group (F,) of each triangle."""
     import trimesh
 
+    from stages.geometry.load import SUFFIXES, check_claims
+
     name = entry.get("mesh_path")
     if not isinstance(name, str) or not name:
         raise UserError(f"{where} has no mesh_path")
@@ -135,8 +144,11 @@ def _mesh(folder: Path, entry: dict[str, Any], smooth: bool, where: str) -> tupl
         raise UserError(f"{where}: mesh_path {name!r} leads out of the scene's folder; put the mesh beside the scene file")
     if not path.is_file():
         raise UserError(f"{where}: mesh file {path} does not exist")
+    if path.suffix.lower() not in SUFFIXES:
+        raise UserError(f"{where}: mesh file {path} is of no kind that is read: expected {', '.join(SUFFIXES)}")
     try:
-        mesh = trimesh.load(path, process=False, force="mesh")
+        check_claims(path, MAX_MESH_BYTES, MAX_MESH_FACES)
+        mesh = trimesh.load(path, process=False, force="mesh")  # its resolver opens nothing outside the mesh's folder
     except Exception as error:  # trimesh's loaders raise whatever they meet
         raise UserError(f"{where}: {path} cannot be read as a mesh ({error})") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
@@ -237,10 +249,10 @@ def load_hdf5(path: Path) -> SceneRecord:
             missing = [name for name in shapes if name not in file]
             if missing:
                 raise UserError(f"{path} has no dataset {', '.join(missing)}: expected {', '.join(shapes)}")
-            arrays = {name: file[name][...].astype(np.float32) for name in shapes if name != "texture"}
-            texture = file["texture"][...]
-    except OSError as error:
-        raise UserError(f"{path} is not an HDF5 file ({error})") from error
+            arrays = {name: _dataset(file, name, path).astype(np.float32) for name in shapes if name != "texture"}
+            texture = _dataset(file, "texture", path)
+    except (OSError, RuntimeError, KeyError) as error:
+        raise UserError(f"{path} is not an HDF5 file that can be read ({error})") from error
     patch_index, patches = None, None
     if texture.ndim == 4:
         texture, patch_index, patches = _patches(texture, path)
@@ -278,6 +290,18 @@ def load_hdf5(path: Path) -> SceneRecord:
         patch_index,
         patches,
     )
+
+
+def _dataset(file: Any, name: str, path: Path) -> np.ndarray:
+    """A dataset whose bytes lie in the file itself: HDF5 can also take them from wherever else it likes."""
+    import h5py
+
+    dataset = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+    if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual or dataset.dtype.kind not in "fiu":
+        raise UserError(f"{path}: {name} is not a dataset of numbers in the file itself (links and virtual ones are not read)")
+    if dataset.nbytes > MAX_DATASET_BYTES:
+        raise UserError(f"{path}: {name} claims {dataset.nbytes:,} bytes, more than {MAX_DATASET_BYTES:,}")
+    return dataset[...]
 
 
 def _patches(texture: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:

@@ -49,10 +49,14 @@ class ImportScene(MapStage):
         return 64
 
     def identity(self, config: ImportConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
+        from stages.geometry.load import inside
+
         root = folder_of(config)
         return {
             "items": {
                 relative: [hash_file(root / relative), *(hash_file(mesh) for mesh in meshes_of(root / relative))]
+                if inside(root / relative, root)
+                else "outside"
                 for relative in scene_files(root)
             }
         }
@@ -68,10 +72,14 @@ class ImportScene(MapStage):
         from dataclasses import replace
 
         from stages.geometry.catalogue import record_id
+        from stages.geometry.load import inside
         from stages.released import load_scene
 
+        path = folder_of(worker) / item.id
+        if not inside(path, folder_of(worker)):
+            raise Reject("unreadable", "a link that leads out of the folder")
         try:
-            scene = load_scene(folder_of(worker) / item.id)
+            scene = load_scene(path)
         except UserError as error:
             raise Reject("unreadable", str(error)) from error
         if len(scene.triangles) > worker.max_triangles:
@@ -102,7 +110,7 @@ def is_scene(path: Path) -> bool:
     """Whether a JSON file is meant to be a scene; one that is not JSON at all is, so that it is rejected by name."""
     try:
         data = json.loads(path.read_bytes())
-    except ValueError:
+    except (ValueError, RecursionError):
         return True
     return isinstance(data, dict) and "objects" in data and "cameras" in data
 
@@ -114,7 +122,7 @@ def meshes_of(path: Path) -> list[Path]:
     try:
         names = [entry["mesh_path"] for entry in json.loads(path.read_bytes())["objects"].values()]
         found = [(path.parent / name).resolve() for name in names]
-    except (ValueError, TypeError, KeyError, AttributeError):
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return []
     return [mesh for mesh in found if mesh.is_relative_to(path.parent.resolve()) and mesh.is_file()]
 

@@ -129,7 +129,9 @@ def decode_scene(id: str, scene: bytes, meta: bytes) -> SceneRecord:
         dtypes = SceneRecord.DTYPES | SceneRecord.PATCH_DTYPES
         arrays = {name: np.ascontiguousarray(values, dtypes[name]) for name, values in arrays.items()}
         return SceneRecord(id, **arrays, meta=unpack_json(meta))
-    except (KeyError, IndexError, ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zipfile.zlib.error) as error:
-        if isinstance(error, UserError):
-            raise
+    except UserError:
+        raise
+    except (
+        KeyError, IndexError, ValueError, TypeError, OSError, EOFError, MemoryError, zipfile.BadZipFile, zipfile.zlib.error,
+    ) as error:  # fmt: skip
         raise UserError(f"scene {id} cannot be decoded ({type(error).__name__}: {error})") from error

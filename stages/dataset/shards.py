@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
+from pipeline.stage import RECORD_ID
 from stages.dataset.encoding import decode_scene
 from stages.exr import LAYERS, decode_layers, decode_lights, view_members
 from stages.records import SceneRecord, ViewRecord
@@ -208,6 +209,8 @@ class ShardDataset:
                     id, group, count, shard, resolution = (
                         row[name] for name in ("id", "split", "triangles", "shard", "resolution")
                     )
+                    if not RECORD_ID.match(id):  # files are named after it
+                        raise ValueError(f"{id!r} is no name of a scene")
                 except (ValueError, KeyError, TypeError) as error:
                     raise UserError(
                         f"line {number} of {file.name} is no line of an index ({error!r}): fetch it again"

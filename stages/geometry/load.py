@@ -300,6 +300,19 @@ def _check_counts(data: bytes, kind: str, max_faces: int) -> None:
             raise Reject("too_large", f"states {number} faces, at most {max_faces} are taken")
 
 
+def check_claims(path: Path, max_bytes: int, max_faces: int) -> None:
+    """Reject a mesh file, for whoever parses it as it is, whose numbers do not fit its size or the limits."""
+    if path.stat().st_size > max_bytes:
+        raise Reject("too_large", f"{path.stat().st_size} bytes, at most {max_bytes} are read")
+    data, kind = path.read_bytes(), path.suffix.lower()
+    if kind in (".gltf", ".glb"):
+        tree = split_glb(data)[0] if kind == ".glb" else json.loads(data)
+        _check_accessors(tree, max_bytes)
+        _check_graph(tree, max_faces)
+    else:
+        _check_counts(data, kind, max_faces)
+
+
 # -- glTF
 
 
@@ -329,6 +342,7 @@ def _prepare_gltf(
     unknown = sorted(e for e in required - HARMLESS if not e.startswith(HARMLESS_PREFIXES))
     if unknown:
         raise Reject("unsupported", f"requires {', '.join(unknown)}")
+    _check_accessors(tree, max_bytes)
     _check_graph(tree, max_faces)
     if _uses_draco(tree) and importlib.util.find_spec("DracoPy") is None:
         raise Reject("needs_draco", "requires Draco compression: install the package DracoPy")
@@ -465,6 +479,23 @@ def _draco_faces(head: bytes) -> int:
                 break
         numbers.append(value)
     return numbers[head[8]]
+
+
+COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+
+
+def _check_accessors(tree: dict[str, Any], max_bytes: int) -> None:
+    """An accessor without a view stands for zeros, as many as it says, and parsers allocate them whether used or not."""
+    total = 0
+    for accessor in tree.get("accessors", []):
+        number = int(accessor["count"])
+        if number < 0:
+            raise Reject("unreadable", f"an accessor of {number} elements")
+        if "bufferView" not in accessor or "sparse" in accessor:
+            total += number * COMPONENT_BYTES[accessor["componentType"]] * COMPONENTS[accessor["type"]]
+    if total > max_bytes:
+        raise Reject("too_large", f"accessors without data of {total} bytes, at most {max_bytes} are taken")
 
 
 def _check_graph(tree: dict[str, Any], max_faces: int) -> None:

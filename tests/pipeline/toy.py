@@ -17,12 +17,16 @@ class NumbersConfig(StageConfig):
     n: int = count(10)
     scale: float = 1.0
     seed: int = 0
+    payload_kb: int = added(0, legacy=0)  # of zeros, in a member of their own
     pause_s: float = runtime(0.0)
     crash: tuple[str, ...] = runtime(())  # items that kill their worker
     crash_once: str | None = runtime(None)  # a folder: the first item to find it without a mark dies
     hang: tuple[str, ...] = runtime(())
+    sleep: tuple[str, ...] = runtime(())
+    stubborn: tuple[str, ...] = runtime(())  # items that sleep and do not let go at SIGTERM
     greedy: tuple[str, ...] = runtime(())
     fail: tuple[str, ...] = runtime(())
+    log_to: str | None = runtime(None)  # a file that gets a line per computed item
 
 
 class Numbers(MapStage):
@@ -41,6 +45,9 @@ class Numbers(MapStage):
         return config
 
     def process(self, config, item):
+        if config.log_to:
+            with open(config.log_to, "a") as file:
+                file.write(item.id + "\n")
         time.sleep(config.pause_s)
         if item.id in config.crash:
             os.kill(os.getpid(), signal.SIGSEGV)
@@ -50,6 +57,10 @@ class Numbers(MapStage):
         if item.id in config.hang:
             while True:
                 pass
+        if item.id in config.stubborn:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if item.id in (*config.sleep, *config.stubborn):
+            time.sleep(3600)
         if item.id in config.greedy:
             hoard = []
             while True:
@@ -59,12 +70,15 @@ class Numbers(MapStage):
         if item.id == "n013":
             raise Reject("unlucky", "it is thirteen")
         value = (seed_for(config.seed, self.name, item.id) % 1000) * config.scale
-        yield Record(item.id, {"value.txt": str(value).encode()})
+        payload = {"payload.bin": bytes(config.payload_kb * 1024)} if config.payload_kb else {}
+        yield Record(item.id, {"value.txt": str(value).encode(), **payload})
 
 
 class SquaresConfig(StageConfig):
     offset: int = 0
     log_to: str | None = runtime(None)  # a file that gets a line per computed item
+    finish_s: float = runtime(0.0)
+    unsteady: bool = runtime(False)  # other output each time
 
 
 class Squares(MapStage):
@@ -88,15 +102,18 @@ class Squares(MapStage):
             with open(config.log_to, "a") as file:
                 file.write(item.id + "\n")
         value = float(numbers.read(item.id).members["value.txt"])
-        yield Record(item.id, {"square.txt": str(value**2 + config.offset).encode()})
+        unsteady = time.time_ns() % 10**6 if config.unsteady else 0
+        yield Record(item.id, {"square.txt": str(value**2 + config.offset + unsteady).encode()})
 
     def finish(self, config, inputs, draft):
         (draft.files / "card.txt").write_text(f"{len(draft.rows())} squares\n")
+        time.sleep(config.finish_s)
         draft.note("count", len(draft.rows()))
 
 
 class TotalConfig(StageConfig):
     steps: int = 3
+    pause_s: float = runtime(0.0)
     plus_numbers: bool = added(False, legacy=False)
 
 
@@ -112,6 +129,7 @@ class Total(RunStage):
 
     def run(self, config, inputs, draft):
         squares = inputs["squares"]
+        time.sleep(config.pause_s)
         total = sum(float(squares.read(id).members["square.txt"]) for id in squares.ids())
         if config.plus_numbers:
             total += sum(float(inputs["numbers"].read(id).members["value.txt"]) for id in squares.ids())

@@ -108,6 +108,16 @@ def graph(nodes: list[dict]) -> bytes:
     return dumps(nodes=nodes)
 
 
+ZEROS = {"componentType": 5126, "type": "MAT4"}
+
+
+def without_data(index: int, number: int, **changes: object) -> bytes:
+    """A glTF with an accessor that stands for so many zeros."""
+    accessors = gltf()["accessors"]
+    accessors[index] = {k: v for k, v in accessors[index].items() if k != "bufferView"} | {"count": number} | changes
+    return dumps(accessors=accessors)
+
+
 NAN, HUGE, FAR = CORNERS.copy(), CORNERS * 1e20, CORNERS * 1e-9 + 1e6
 NAN[3, 1] = np.nan
 LINE = np.stack([np.linspace(0, 1, 8)] * 3, axis=1)
@@ -139,6 +149,10 @@ MALFORMED = {
     "file_uri.gltf": (dumps(uri="file:///etc/passwd"), "unsafe_path"),
     "missing.gltf": (dumps(uri="nowhere.bin"), "unreadable"),
     "other_suffix.gltf": (dumps(uri="data.dat"), "unsupported"),
+    "zeros.gltf": (without_data(0, 10**12), "too_large"),
+    "sparse_zeros.gltf": (without_data(0, 10**9, sparse={"count": 1}), "too_large"),
+    "negative.gltf": (without_data(0, -5), "unreadable"),
+    "unused_zeros.gltf": (dumps(accessors=[*gltf()["accessors"], {**ZEROS, "count": 10**9}]), "too_large"),
     "cycle.gltf": (graph([{"mesh": 0, "children": [1]}, {"children": [0]}]), "unreadable"),
     "own_child.gltf": (graph([{"mesh": 0, "children": [0]}]), "unreadable"),
     "two_parents.gltf": (graph([{"children": [1, 2]}, {"children": [2]}, {"mesh": 0}]), "unreadable"),

@@ -1,0 +1,373 @@
+"""How far the line scales: a store of a million items, two workers over one, and what the paper's data would take.
+
+    python bench/scale.py [--only store,workers,model] [--work FOLDER]
+
+store    a million items with empty payloads in 10,000 parts, and a second artifact made from it but for its last 10 parts.
+         Time and peak memory of ``ls``, of planning, of resuming the second, of ``verify`` and ``verify --deep``, each in
+         a process of its own. *build* makes the store with the engine's own writers, without waiting for the disk.
+workers  remesh and render on one and on two workers of one thread each, beside one and two copies of a pure CPU loop: a
+         machine whose cores share caches, memory or clocks does not double either. Every item is a part of its own here, so
+         that no worker runs out of work early and the cost of parts is in it. *Steady* is the work done per second while both
+         workers are at work, in units of what the same parts took one worker; *whole* is the stage from its call to its
+         artifact: start of processes, imports, opening, finish and all. Bar: steady at least 0.95 of the loop's.
+model    time, storage and cost of 2M scenes x 4 views, from what items took and weighed in the artifacts of ``--store``,
+         or in a sample made for it (the paper's settings at 256 px on made-up objects). What is assumed is an option.
+
+Some 15 minutes on two quiet cores, half of it the sample of *model*.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import re
+import resource
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)] * (str(ROOT) not in sys.path)  # for the system below and in workers
+
+from pipeline import commands, runner  # noqa: E402
+from pipeline.config import StageConfig, count, parse  # noqa: E402
+from pipeline.hydra_config import compose  # noqa: E402
+from pipeline.stage import Item, MapStage, Record, System, load_system  # noqa: E402
+from pipeline.store import Artifact, Store  # noqa: E402
+
+LEFT = 10  # parts of the second artifact that are not there yet
+PARTS = ("store", "workers", "model")
+
+
+# --- a million items --------------------------------------------------------------------------------------------------
+
+
+class EmptyConfig(StageConfig):
+    n: int = count(1_000_000)
+
+
+class Empty(MapStage):
+    name, version, Config = "empty", 1, EmptyConfig
+
+    def part_size(self, config: Any, inputs: Any) -> int:
+        return 100
+
+    def items(self, config: Any, inputs: Any) -> Iterator[Item]:
+        return (Item(f"{number:07d}", needs=()) for number in range(config.n))
+
+    def open(self, config: Any, inputs: Any, environment: Any) -> Any:
+        return inputs
+
+    def process(self, inputs: Any, item: Item) -> Iterator[Record]:
+        yield Record(item.id, {"nothing": b""})
+
+
+class Again(Empty):
+    """Item by item from ``empty``, as render is from scene."""
+
+    name, inputs, Config = "again", ("empty",), StageConfig
+
+    def items(self, config: Any, inputs: Any) -> Iterator[Item]:
+        return (Item(row.id, row.group, (("empty", row.id),)) for row in inputs["empty"].rows())
+
+    def process(self, inputs: Any, item: Item) -> Iterator[Record]:
+        yield inputs["empty"].read(item.id)
+
+
+SYSTEM = System("scale", {"empty": "bench.scale:Empty", "again": "bench.scale:Again"})
+
+
+def config_of(folder: Path, items: int) -> dict[str, Any]:
+    return {"system": "bench.scale", "stage": "again", "store": str(folder), "empty": {"n": items}, "again": {}}
+
+
+def fill(folder: Path, items: int, name: str, left: int) -> None:
+    """Make the parts of a draft, all but the last, as workers would, without starting any."""
+    run, system, sections = runner.split_config(config_of(folder, items))
+    store = Store(folder)
+    plan = runner.make_plan(run, system, sections, lambda path: "")
+    planned = plan[name]
+    inputs = {parent: store.find(parent, plan[parent].key) for parent in planned.stage.inputs}
+    draft = store.draft(name, planned.key, planned.preimage, print, {"system": run.system, "config": {}})
+    draft.set_environment({})
+    stage = load_system("bench.scale").stage(name)
+    listed = sorted(stage.items(planned.config, inputs), key=lambda item: (item.group, item.id))
+    keys = runner.item_keys(planned, listed, inputs)
+    parts = list(runner._parts(listed, keys, stage.part_size(planned.config, inputs)))
+    for group, indices in parts[: len(parts) - left]:
+        writer = draft.open_part()
+        for index in indices:
+            writer.add(Record(listed[index].id, {"nothing": b""}), listed[index].id, group, keys[index])
+        part_key = runner.digest_of({"group": group, "items": tuple(keys[index] for index in indices)})
+        ids = [listed[index].id for index in indices]
+        draft.finish_part(part_key, {**writer.close(), "part_key": part_key, "group": group, "items": ids, "rejects": []})
+
+
+def step(name: str, folder: Path, items: int) -> None:
+    """One step in this process; its last line of output is what it took, as JSON."""
+    arguments = argparse.Namespace(stage=None, artifacts=[], deep=name == "verify --deep")
+    before, began = time.process_time(), time.monotonic()
+    if name == "build":
+        os.fsync = lambda handle: None  # it is not what is timed
+        fill(folder, items, "empty", 0)
+        runner.run_pipeline({**config_of(folder, items), "stage": "empty", "workers": 0}, ["bench"])
+        fill(folder, items, "again", LEFT)
+    elif name == "ls":
+        commands.command_ls(Store(folder), arguments)
+    elif name.startswith("verify"):
+        assert commands.command_verify(Store(folder), arguments) == 0
+    else:
+        runner.run_pipeline({**config_of(folder, items), "workers": 2, "plan": name == "plan"}, ["bench"])
+    peak = {who: resource.getrusage(kind).ru_maxrss / 1024 for who, kind in RUSAGE.items()}
+    print(json.dumps({"wall": time.monotonic() - began, "cpu": time.process_time() - before, **peak}))
+
+
+RUSAGE = {"own": resource.RUSAGE_SELF, "worker": resource.RUSAGE_CHILDREN}
+
+
+def bench_store(work: Path, items: int) -> None:
+    folder = work / "million"
+    shutil.rmtree(folder, ignore_errors=True)
+    print(f"store: {items:,} items with empty payloads, 100 a part; two artifacts, the second but for its last {LEFT} parts")
+    print(f"  {'':<14}{'s':>8}{'CPU s':>8}{'MB':>7}{'MB, largest worker':>20}")
+    for name in ("build", "ls", "plan", "resume", "ls", "plan", "verify", "verify --deep"):
+        command = [sys.executable, __file__, "--step", name, "--work", str(folder), "--items", str(items)]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        if done.returncode:
+            raise SystemExit(f"{name} failed:\n{done.stdout}{done.stderr}")
+        took = json.loads(done.stdout.splitlines()[-1])
+        worker = f"{took['worker']:20.0f}" if name == "resume" else ""
+        print(f"  {name:<14}{took['wall']:8.1f}{took['cpu']:8.1f}{took['own']:7.0f}{worker}", flush=True)
+    print("  bar: resume under 30 s and 1,000 MB")
+    shutil.rmtree(folder)
+
+
+# --- two workers over one ---------------------------------------------------------------------------------------------
+
+LOOP = """import time
+began, x = time.perf_counter(), 1
+for i in range({n}):
+    x = x * 48271 % 2147483647
+print(time.perf_counter() - began)"""
+
+
+def loop_ratio(rounds: int = 3, n: int = 30_000_000) -> float:
+    """Throughput of two copies of a pure CPU loop over one's, the median of ``rounds``."""
+
+    def seconds(copies: int) -> float:
+        command = [sys.executable, "-c", LOOP.format(n=n)]
+        running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(copies)]
+        return statistics.mean(float(process.communicate()[0]) for process in running)
+
+    return statistics.median(2 * seconds(1) / seconds(2) for _ in range(rounds))
+
+
+def timed_stage(root: dict[str, Any], stage: str, workers: int) -> tuple[float, list[tuple[str, float]]]:
+    """Compute the stage anew. Seconds of the whole, and (part, seconds since the workers were asked for) as parts came in."""
+    arrived: list[tuple[str, float]] = []
+    run_parts = runner.run_parts
+
+    def noting(tasks: Any, workers: int, threads: int, limits: Any, on_result: Any, log: Any) -> None:
+        assert threads == 1
+        began = time.perf_counter()
+
+        def note(result: Any) -> None:
+            arrived.append((result.part_key, time.perf_counter() - began))
+            on_result(result)
+
+        run_parts(tasks, workers, threads, limits, note, log)
+
+    kind = type(load_system(root["system"]).stage(stage))
+    with (
+        mock.patch.object(runner, "run_parts", noting),
+        mock.patch.object(kind, "part_size", lambda self, config, inputs: 1),
+        mock.patch("os.cpu_count", lambda: workers),  # from which the runner takes the threads of a worker: one
+    ):
+        began = time.perf_counter()
+        runner.run_pipeline({**root, "stage": stage, "force": stage, "workers": workers}, ["bench"], lambda text: None)
+        return time.perf_counter() - began, arrived
+
+
+def steady_ratio(alone: Sequence[tuple[str, float]], together: Sequence[tuple[str, float]], workers: int = 2) -> float:
+    """Work per second with ``workers`` over work per second with one, between each worker's first part and its last.
+
+    A part's work is the time from its predecessor's arrival to its own when one worker made all.
+    """
+    work = {part: after - before for (_, before), (part, after) in zip(alone, alone[1:], strict=False)}
+    window = together[workers - 1 : len(together) - workers + 1]
+    done = sum(work.get(part, 0.0) for part, _ in window[1:])
+    return done / (window[-1][1] - window[0][1])
+
+
+def bench_workers(work: Path, objects: int, scenes: int) -> None:
+    store = work / "workers"
+    overrides = [
+        f"store={store}", f"collect.per_family={objects}", f"scene.count.train={scenes}", "scene.count.validation=2",
+        "scene.count.test=2", "render.resolution=64", "render.max_spp=64", "render.target_error=0",
+    ]  # fmt: skip
+    root = compose(overrides)
+    runner.run_pipeline({**root, "stage": "render"}, ["bench"])  # what both read, and what the machine keeps of a first run
+    print("workers: throughput of two workers over one, one thread each")
+    before = loop_ratio()
+    rows = []
+    for stage in ("remesh", "render"):
+        whole_1, alone = timed_stage(root, stage, 1)
+        whole_2, together = timed_stage(root, stage, 2)
+        rows.append((stage, len(alone), whole_1, whole_2, steady_ratio(alone, together), whole_1 / whole_2))
+    after = loop_ratio()
+    loop = (before + after) / 2
+    print(f"  pure CPU loop: two copies do {loop:.3f} times what one does ({before:.3f} before, {after:.3f} after)")
+    print(f"  {'':<8}{'parts':>6}{'s, one':>9}{'s, two':>9}{'steady':>9}{'of loop':>9}{'whole':>9}{'of loop':>9}")
+    for stage, parts, one, two, steady, whole in rows:
+        print(f"  {stage:<8}{parts:>6}{one:9.1f}{two:9.1f}{steady:9.3f}{steady / loop:9.3f}{whole:9.3f}{whole / loop:9.3f}")
+    print("  bar: steady at least 0.95 of the loop")
+
+
+# --- the paper's data -------------------------------------------------------------------------------------------------
+
+OF_OBJECTS, OF_SCENES = ("collect", "remesh", "decimate"), ("scene", "render", "shard")
+STARTED = re.compile(r"(\S+ \S+) \d+ items of \S+ \S+: process (\d+) on (\S+)")
+ITEM = re.compile(r"\S+ \S+ (\S+): ([0-9.]+) s, ")
+
+
+def seconds_per_item(logs: Path) -> tuple[float, int]:
+    """Mean seconds of an item, and of how many: from an artifact's logs, less the first item of every process (imports)."""
+    parts = []
+    for path in logs.glob("*.log"):
+        told = path.read_text(errors="replace").splitlines()
+        started = next((match for text in told if (match := STARTED.match(text))), None)
+        if started:
+            taken = [float(match[2]) for text in told if (match := ITEM.match(text)) and "taken over" not in text]
+            parts.append((datetime.fromisoformat(started[1]), started[2] + started[3], taken))
+    seen, seconds = set(), []
+    for _, process, taken in sorted(parts):
+        seconds += taken[process not in seen :]
+        seen.add(process)
+    return (statistics.mean(seconds) if seconds else 0.0), len(seconds)
+
+
+def measured(store: Store) -> dict[str, tuple[float, int, float, int]]:
+    """Stage -> (seconds per item, of how many items, bytes per record, records), of the newest artifact of each."""
+    found = {}
+    for stage in OF_OBJECTS + OF_SCENES:
+        artifacts: list[Artifact] = store.artifacts(stage)
+        if not artifacts:
+            raise SystemExit(f"model: {store.root} has no artifact of {stage}: make the line up to shard first")
+        outputs = artifacts[-1].manifest["outputs"]
+        seconds, items = seconds_per_item(artifacts[-1].path / "logs")
+        found[stage] = seconds, items, outputs["bytes"] / max(outputs["records"], 1), outputs["records"]
+    return found
+
+
+def make_sample(work: Path, scenes: int) -> Store:
+    """The line up to shard by the paper's settings, on few made-up objects."""
+    store = work / "sample"
+    overrides = [
+        f"store={store}", "stage=shard", "collect.per_family=1", "remesh=released", "scene=paper", "scene.max_triangles=1536",
+        f"scene.count.train={scenes}", "scene.count.validation=1", "scene.count.test=1", "render=paper",
+    ]  # fmt: skip
+    runner.run_pipeline(compose(overrides), ["bench"])
+    return Store(store)
+
+
+def training_days(gpus: int) -> float:
+    """Days of ``paper_256`` on A100s at the utilisation that ``plan=true`` assumes."""
+    from model.flops import TRAINING, forward_flops, ideal_seconds
+    from stages.s06_train import A100_TFLOPS, UTILISATION
+
+    root = compose(["stage=train", "experiment=paper_256", "collect.ids_file=FILE"])
+    config = parse(load_system("renderformer").stage("train").Config, root["train"], "train")
+    side, triangles = root["render"]["resolution"], root["scene"]["max_triangles"]
+    flops = forward_flops(config.model.build(), [triangles], config.views_per_scene, side, side)
+    peaks = {name: value * 1e12 * UTILISATION for name, value in A100_TFLOPS.items()}
+    return TRAINING * ideal_seconds(flops, peaks, config.precision) * config.batch_scenes * config.steps / 86400 / gpus
+
+
+def bench_model(work: Path, options: argparse.Namespace) -> None:
+    store = Store(options.store) if options.store else make_sample(work, options.sample_scenes)
+    found = measured(store)
+    print(f"model: {options.objects:,} objects, {options.scenes:,} scenes of 4 views; per item as in {store.root}")
+    print(f"  {'':<9}{'s, one core':>12}{'items':>7}{'kB':>9}{'records':>9}{'of':>11}{'core-hours':>12}{'TB':>8}")
+    hours: dict[str, float] = {}
+    terabytes: dict[str, float] = {}
+    for stage, (seconds, items, size, records) in found.items():
+        number = options.objects if stage in OF_OBJECTS else options.scenes
+        hours[stage], terabytes[stage] = seconds * number / 3600, size * number / 1e12
+        per_item = f"{seconds:12.3f}{items:7d}{size / 1e3:9.1f}{records:9d}"
+        print(f"  {stage:<9}{per_item}{number:11,}{hours[stage]:12,.0f}{terabytes[stage]:8.2f}")
+    core_hours, everything, kept = sum(hours.values()), sum(terabytes.values()), terabytes["shard"]
+    days = core_hours / options.cores / 24 / options.use
+    on_gpus = hours["render"] / options.gpu_cores / options.gpus / 24
+    train = training_days(options.gpus)
+    cores, node = core_hours / options.use * options.core_hour, train * 24 * options.node_hour
+    disk = options.tb_month * (everything * days / 30 + kept * options.months)
+    print(f"  {'all':<57}{core_hours:12,.0f}{everything:8.2f}")
+    print(f"  {options.cores:,} CPU cores: {days:.1f} days, {options.use:.0%} of them at work")
+    print(f"  {options.gpus} GPUs of one node: render it in {on_gpus:.1f} days, a GPU taken for {options.gpu_cores:g} cores")
+    print(
+        f"  {options.gpus} A100s of one node: train paper_256 in {train:.1f} days, at 40 % of their peak (the authors: 5 days)"
+    )
+    print("  USD:")
+    print(f"  {cores:10,.0f} for cores, at {options.core_hour:g} a core-hour")
+    print(f"  {node:10,.0f} for training, at {options.node_hour:g} a node-hour")
+    print(
+        f"  {disk:10,.0f} for disks, at {options.tb_month:g} a TB-month: all during the run, shards {options.months:g} months"
+    )
+
+
+def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--only", type=lambda text: text.split(","), default=list(PARTS), help=f"of {','.join(PARTS)}")
+    add("--work", type=Path, help="where stores are made, and kept (default: a temporary folder)")
+    add("--items", type=int, default=1_000_000, help="store: items")
+    add("--per-family", type=int, default=2, help="workers: objects of each of 21 families to remesh")
+    add("--worker-scenes", type=int, default=40, help="workers: scenes to render")
+    add("--store", help="model: take figures from the artifacts of this store")
+    add("--sample-scenes", type=int, default=4, help="model: training scenes of the sample")
+    add("--objects", type=int, default=800_000, help="model: objects (Objaverse 1.0 has about so many)")
+    add("--scenes", type=int, default=2_000_000, help="model: scenes, of four views each")
+    add("--cores", type=int, default=1000)
+    add("--use", type=float, default=0.9, help="model: share of the cores' time that is work (assumed)")
+    add("--gpus", type=int, default=8, help="model: of a node")
+    add("--gpu-cores", type=float, default=100, help="model: CPU cores that one GPU renders like (assumed)")
+    add("--core-hour", type=float, default=0.04, help="model: USD")
+    add("--node-hour", type=float, default=16.0, help="model: USD of a GPU node")
+    add("--tb-month", type=float, default=20.0, help="model: USD")
+    add("--months", type=float, default=3.0, help="model: that the shards are kept")
+    add("--step", help=argparse.SUPPRESS)
+    options = parser.parse_args(words)
+    for name in options.only:
+        if name not in PARTS:
+            parser.error(f"--only {name}: choose from {', '.join(PARTS)}")
+    return options
+
+
+def main() -> None:
+    options = parsed()
+    if options.step:
+        step(options.step, options.work, options.items)
+        return
+    with contextlib.ExitStack() as stack:
+        work = options.work or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        work.mkdir(parents=True, exist_ok=True)
+        if "store" in options.only:
+            bench_store(work, options.items)
+        if "workers" in options.only:
+            bench_workers(work, options.per_family, options.worker_scenes)
+        if "model" in options.only:
+            bench_model(work, options)
+
+
+if __name__ == "__main__":
+    main()

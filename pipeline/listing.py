@@ -1,0 +1,93 @@
+"""Where every record of an artifact lies: the rows of ``items.jsonl``, read when they are asked for.
+
+A dataset may have millions of records and every process that reads some of them needs to find them: a listing keeps where the
+lines of its file begin (about 150 bytes a record), not the parsed rows (about 1,500).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, BinaryIO, overload
+
+# a line's beginning, as ``json_line`` writes a row: keys are sorted, and an id has nothing to escape
+_ID = re.compile(rb'\{"digest": "[0-9a-f]*", "group": "(?:[^"\\]|\\.)*", "id": "([A-Za-z0-9_-]+)", ')
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Where one record lies: ``members`` maps a member's name to (offset, bytes) in the part's tar."""
+
+    id: str
+    item: str
+    group: str
+    part: str
+    digest: str
+    item_key: str
+    members: Mapping[str, tuple[int, int]]
+
+    def to_json(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.__slots__}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Row:
+        members = {name: (int(offset), int(size)) for name, (offset, size) in data["members"].items()}
+        group, part = sys.intern(data["group"]), sys.intern(data["part"])
+        return cls(data["id"], data["item"], group, part, data["digest"], data["item_key"], members)
+
+
+class Listing(Sequence[Row]):
+    """The rows of one file, in its order."""
+
+    def __init__(self, path: Path):
+        self._path = path
+
+    @cached_property
+    def _file(self) -> BinaryIO:
+        return open(self._path, "rb")  # noqa: SIM115 - for single lines, as long as the listing lives
+
+    @cached_property
+    def _lines(self) -> tuple[array, dict[str, int]]:
+        """Where each line begins and the last ends, and the number of each record's line."""
+        starts, numbers = array("Q", [0]), {}
+        with open(self._path, "rb") as file:
+            for number, text in enumerate(file):
+                match = _ID.match(text)
+                if match is None:
+                    raise ValueError(f"{self._path}: line {number + 1} is no row")
+                starts.append(starts[-1] + len(text))
+                numbers[match[1].decode()] = number
+        return starts, numbers
+
+    def __len__(self) -> int:
+        return len(self._lines[0]) - 1
+
+    def __iter__(self) -> Iterator[Row]:
+        with open(self._path, "rb") as file:
+            for text in file:
+                yield Row.from_json(json.loads(text))
+
+    @overload
+    def __getitem__(self, index: int) -> Row: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Row]: ...
+    def __getitem__(self, index: int | slice) -> Row | list[Row]:
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        starts, number = self._lines[0], range(len(self))[index]
+        start, end = starts[number], starts[number + 1]
+        return Row.from_json(json.loads(os.pread(self._file.fileno(), end - start, start)))
+
+    def holds(self, record_id: str) -> bool:
+        return record_id in self._lines[1]
+
+    def find(self, record_id: str) -> Row:
+        """The record's row; KeyError if there is none."""
+        return self[self._lines[1][record_id]]

@@ -1,0 +1,192 @@
+"""Mending a damaged artifact: ``lightmill repair``.
+
+A draft of the same key takes over every part that can be shown to be sound, the others are computed as in any interrupted
+run, and the result is swapped in; the damaged artifact goes to the trash. Rows are believed only where the bytes of their part
+bear them out, so any file of the artifact may be the damaged one: what it takes to compute is in the manifest and again in
+``draft.json``, and one of the two must be sound.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import tarfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import parse
+from pipeline.errors import Damaged, UserError
+from pipeline.files import hash_file
+from pipeline.keys import digest_of
+from pipeline.runner import Planned, RunConfig, make_artifact, plan_stage
+from pipeline.stage import MapStage, load_system
+from pipeline.store import Artifact, Draft, HashCache, Row, Store, read_draft, record_digest
+from pipeline.worker import log_file
+
+
+def repair(store: Store, artifact: Artifact, workers: int | None = None, out: Callable[[str], None] = print) -> Artifact:
+    """Compute the damaged parts of the artifact anew and swap the mended one in; returns it."""
+    name = f"{artifact.path.parent.name}/{artifact.path.name}"
+    problems = artifact.verify(deep=True)
+    if not problems:
+        out(f"{name}: sound, nothing to repair")
+        return artifact
+    for problem in problems:
+        out(f"{name}: {problem}")
+    origin = _origin(artifact)
+    run = RunConfig(
+        system=origin["system"],
+        stage=(origin["preimage"]["stage"],),
+        force=(origin["preimage"]["stage"],),
+        store=str(store.root),
+        workers="auto" if workers is None else workers,
+    )
+    planned = _planned(store, name, origin)
+    inputs = {}
+    for parent, key in origin["preimage"]["inputs"].items():
+        inputs[parent] = store.find(parent, key)
+        if inputs[parent] is None:
+            raise UserError(
+                f"{name} was made from {parent} {key[:12]}, which is gone: make that first, or compute {_again(origin)}"
+            )
+
+    def adopt(draft: Draft) -> None:
+        if origin.get("environment") is not None:
+            draft.set_environment(origin["environment"])
+        taken = 0
+        if isinstance(planned.stage, MapStage):
+            for marker in sound_parts(artifact):
+                source = artifact.part_path(marker["digest"]) if marker["digest"] else artifact.path
+                taken += draft.link_part(source, marker["part_key"], marker)
+                with contextlib.suppress(OSError):
+                    shutil.copyfile(log_file(artifact.path, marker["part_key"]), log_file(draft.path, marker["part_key"]))
+            out(f"{name}: {taken} part(s) are sound and kept")
+        else:
+            out(f"{name}: {planned.name} is one computation and has no parts: all of it is computed again")
+
+    old_digest = _manifest(artifact).get("outputs", {}).get("digest")
+    mended = make_artifact(
+        run, load_system(run.system), planned, inputs, store, ["lightmill", "repair", name], out, adopt=adopt
+    )
+    if old_digest is None:
+        out(f"{name}: the old digest is lost with the manifest, the new one is {mended.digest[:12]}")
+    return mended
+
+
+def _manifest(artifact: Artifact) -> dict[str, Any]:
+    try:
+        return artifact.manifest
+    except Damaged:
+        return {}
+
+
+def _origin(artifact: Artifact) -> dict[str, Any]:
+    """Key, preimage, system, config and environment, from whichever copy is sound."""
+    for copy in (_manifest(artifact), read_draft(artifact.path) or {}):
+        if "config" in copy and digest_of(copy["preimage"]) == copy["key"]:
+            return copy
+    raise Damaged(
+        f"{artifact.path}: neither manifest.json nor draft.json says soundly how it was made: delete the folder and run the "
+        "command that made it again"
+    )
+
+
+def _again(origin: Mapping[str, Any]) -> str:
+    command = origin.get("command")
+    return f"all of it again with `{command} force={origin['preimage']['stage']}`" if command else "all of it again"
+
+
+def _planned(store: Store, name: str, origin: Mapping[str, Any]) -> Planned:
+    """The stage as it was planned; its key must come out as it was."""
+    preimage = origin["preimage"]
+    stage = load_system(origin["system"]).stage(preimage["stage"])
+    config = parse(stage.Config, origin["config"], stage.name)
+    planned = plan_stage(stage, config, preimage["inputs"], HashCache(store.root / ".cache" / "hashes.json"))
+    if planned.key != origin["key"]:
+        raise UserError(
+            f"{name} cannot be repaired part by part: the version of {stage.name} or the source files that it read have "
+            f"changed since; compute {_again(origin)}"
+        )
+    return planned
+
+
+def sound_parts(artifact: Artifact) -> Iterator[dict[str, Any]]:
+    """Markers of the parts whose tar, rows and rejects are what was written, whatever else is damaged."""
+    rows: dict[str, list[Row]] = {}
+    for line in _json_lines(artifact.path / "items.jsonl"):
+        with contextlib.suppress(KeyError, TypeError, ValueError, AttributeError):
+            row = Row.from_json(line)
+            rows.setdefault(row.part, []).append(row)
+    outputs = _manifest(artifact).get("outputs")
+    if outputs is None:  # then rejects cannot be checked, and parts that had any are computed again
+        for digest, found in rows.items():
+            items = sorted({row.item: row.item_key for row in found}.items())
+            yield from _part(artifact, {"digest": digest, "group": found[0].group}, items, found, [])
+        return
+    try:
+        rejects = {reject["item"]: reject for reject in artifact.rejects() if not reject.get("whole")}
+    except Damaged:
+        rejects = {}
+    for part in outputs["parts"] + [{**part, "digest": None, "bytes": 0} for part in outputs["empty_parts"]]:
+        found = rows.get(part["digest"], [])
+        keys = {row.item: row.item_key for row in found} | {
+            item: rejects[item]["item_key"] for item in part["items"] if item in rejects
+        }
+        if set(keys) == set(part["items"]):
+            items = [(item, keys[item]) for item in part["items"]]
+            yield from _part(artifact, part, items, found, [rejects[item] for item in part["items"] if item in rejects])
+
+
+def _part(
+    artifact: Artifact, part: Mapping[str, Any], items: list[tuple[str, str]], rows: list[Row], rejects: list[dict[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    """The part's marker, if it is sound: its key is the hash of its items', its rows say what the tar holds."""
+    part_key = digest_of({"group": part["group"], "items": [key for _, key in items]})
+    if part.get("part_key", part_key) != part_key or any(row.group != part["group"] for row in rows):
+        return
+    size = 0
+    if part["digest"] is not None:
+        path = artifact.part_path(part["digest"])
+        if not path.is_file() or hash_file(path) != part["digest"]:
+            return
+        size = path.stat().st_size
+        rows = sorted(rows, key=lambda row: min((offset for offset, _ in row.members.values()), default=0))
+        with tarfile.open(path) as tar:
+            held = {member.name: (member.offset_data, member.size) for member in tar.getmembers()}
+        told = {f"{row.id}.{name}": place for row in rows for name, place in row.members.items()}
+        if held != told or sum(len(row.members) for row in rows) != len(held) or not _records_match(path, rows):
+            return
+    yield {
+        "digest": part["digest"],
+        "bytes": size,
+        "rows": [row.to_json() for row in rows],
+        "part_key": part_key,
+        "group": part["group"],
+        "items": [item for item, _ in items],
+        "rejects": rejects,
+    }
+
+
+def _records_match(path: Path, rows: list[Row]) -> bool:
+    with open(path, "rb") as file:
+        for row in rows:
+            members = {}
+            for name, (offset, size) in row.members.items():
+                file.seek(offset)
+                members[name] = file.read(size)
+            if record_digest(members) != row.digest:
+                return False
+    return True
+
+
+def _json_lines(path: Path) -> Iterator[Any]:
+    """Those lines of the file that are still JSON."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return
+    for line in data.split(b"\n"):
+        with contextlib.suppress(ValueError):
+            yield json.loads(line)

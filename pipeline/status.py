@@ -1,0 +1,139 @@
+"""The state of runs, readable while they run and after they died: ``lightmill status``.
+
+A run writes what it knows into ``running/run.json`` of the draft that it is making, at most once a second; whoever asks reads
+that, counts the draft's markers and looks whether the claim is held. There is no server: the store alone answers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.progress import duration
+from pipeline.store import Store
+
+WRITE_EVERY_S = 1.0
+MAX_FAILURES = 100  # that a state names
+RUN = "run.json"
+
+
+class RunState:
+    """What a run says of the artifact it is making. Losing it costs nothing: a full disk must not stop a run here."""
+
+    def __init__(self, draft: Path, **facts: Any):
+        self._path = draft / "running" / RUN
+        self._began = time.monotonic()
+        self._written = -WRITE_EVERY_S
+        self._facts = {
+            "host": socket.gethostname(), "pid": os.getpid(), "started": time.time(), "failures": [], "rejects": {}, **facts,
+        }  # fmt: skip
+        self.update(now=True)
+
+    def update(self, now: bool = False, **facts: Any) -> None:
+        """Change facts; written at once on ``now``, else at the next chance after a second."""
+        self._facts.update(facts)
+        elapsed = time.monotonic() - self._began
+        if not now and elapsed - self._written < WRITE_EVERY_S:
+            return
+        self._written = elapsed
+        temporary = self._path.with_suffix(f".{os.getpid()}")
+        with contextlib.suppress(OSError):
+            temporary.write_text(json.dumps({**self._facts, "seconds": round(elapsed, 3)}))
+            os.replace(temporary, self._path)
+
+    def add_rejects(self, rejects: Mapping[str, int]) -> None:
+        counts = self._facts["rejects"]
+        for reason, count in rejects.items():
+            counts[reason] = counts.get(reason, 0) + count
+
+    def add_failure(self, item: str, trace: str, log: Path) -> None:
+        if len(self._facts["failures"]) < MAX_FAILURES:
+            last = trace.strip().splitlines()[-1]
+            self._facts["failures"].append({"item": item, "error": last, "log": f"logs/{log.name}"})
+
+    def end(self, status: int, message: str) -> None:
+        """The run stops here without an artifact."""
+        self.update(now=True, status=status, message=message)
+
+
+def read_states(store: Store, stage: str | None = None) -> list[dict[str, Any]]:
+    """One plain dict per draft of the store, the one that changed last at the end.
+
+    ``state``: running, waiting for items (``items``: who does what for how long), stopped (a message says why) or dead.
+    """
+    found = []
+    for path in store.drafts():
+        if stage not in (None, path.parent.name):
+            continue
+        key = path.name.removesuffix(".partial")
+        facts = _read(path / "running" / RUN)
+        holder = store.claim(path.parent.name, key).holder()
+        state = "running" if holder else "stopped" if "status" in facts else "dead"
+        marked = list((path / "markers").glob("[!.]*.json"))
+        items = []
+        if holder:
+            for file in sorted((path / "running").glob("*.json")):
+                item = _read(file)
+                if "item" in item:
+                    items.append({"item": item["item"], "pid": item["pid"], "seconds": round(time.time() - item["time"], 1)})
+        changed = max([file.stat().st_mtime for file in (path / "markers", path / "running") if file.exists()], default=0.0)
+        found.append(
+            {**facts, "stage": path.parent.name, "key": key, "state": state, "holder": holder, "parts_done": len(marked),
+             "items": items, "changed": changed, "path": str(path)}
+        )  # fmt: skip
+    return sorted(found, key=lambda state: state["changed"])
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+
+
+def lines(state: Mapping[str, Any], made: Sequence[str] = ()) -> list[str]:
+    """A draft's state for people; ``made``: stages of its plan that are in the store by now."""
+    clock = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(state["changed"]))
+    holder = state["holder"] or {}
+    what = {
+        "running": f"running, process {holder.get('pid')} on {holder.get('host')}",
+        "stopped": f"stopped with status {state.get('status')} at {clock}",
+        "dead": f"not running: its process ended without a word (killed?), last sign {clock}",
+    }[state["state"]]
+    out = [f"{state['stage']}/{state['key'][:12]}.partial  {what}"]
+
+    def add(name: str, text: str) -> None:
+        out.append(f"  {name:<9} {text}")
+
+    if state.get("plan"):
+        marks = ["done" if name in made else state["state"] if name == state["stage"] else "to come" for name in state["plan"]]
+        add("stages", ", ".join(f"{name} {mark}" for name, mark in zip(state["plan"], marks, strict=True)))
+    if state.get("parts"):
+        rate = (state["done"] - state["reused"]) / state["seconds"] if state["seconds"] else 0.0
+        reused = f", {state['reused']} of them from before" if state["reused"] else ""
+        left = ""
+        if state["state"] == "running":
+            left = f", {duration((state['total'] - state['done']) / rate)} left" if rate else ", time left not known yet"
+        add("parts", f"{state['parts_done']} of {state['parts']}")
+        add("items", f"{state['done']} of {state['total']}{reused}, {rate:.2f}/s{left}")
+    elif state["parts_done"]:
+        add("parts", str(state["parts_done"]))
+    if state.get("line"):
+        add("last", state["line"])
+    if state.get("rejects"):
+        add("rejects", ", ".join(f"{count} {reason}" for reason, count in sorted(state["rejects"].items())))
+    for failure in state.get("failures", ()):
+        add("failed", f"{failure['item']}: {failure['error']}  ({state['path']}/{failure['log']})")
+    for item in state["items"]:
+        add("now", f"{item['item']} for {duration(item['seconds'])}, process {item['pid']}")
+    if state.get("message"):
+        add("message", state["message"])
+    if state["state"] != "running" and state.get("command"):
+        add("go on", state["command"])
+    return out

@@ -1,0 +1,223 @@
+"""Damaged bytes: ``verify --deep`` finds them all, nothing is made from them, ``repair`` makes only the damaged parts anew."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+
+import pytest
+
+from pipeline import commands
+from pipeline.errors import Damaged, UserError
+from pipeline.repair import repair
+from pipeline.runner import run_pipeline
+from pipeline.store import Artifact, Store
+
+
+@pytest.fixture
+def run(tmp_path):
+    """run(numbers={...}, ...) -> (artifacts by stage, lines printed); ``computed`` says which squares were computed since."""
+
+    def go(**overrides):
+        lines: list[str] = []
+        root = {"system": "tests.pipeline.toy", "stage": "total", "store": str(tmp_path / "store"), "workers": 0}
+        root |= {"numbers": {"n": 15}, "squares": {"log_to": str(tmp_path / "computed")}, "total": {}} | overrides
+        return run_pipeline(root, ["test"], lines.append)["artifacts"], lines
+
+    return go
+
+
+def computed(folder: Path) -> list[str]:
+    """Squares computed since the last call."""
+    path = folder / "computed"
+    words = path.read_text().split() if path.exists() else []
+    path.unlink(missing_ok=True)
+    return sorted(words)
+
+
+def flip(path: Path, seed: int = 0) -> None:
+    """Flip one bit, drawn from the seed; an empty file gets a byte."""
+    data = bytearray(path.read_bytes() or b"?")
+    bit = random.Random(seed).randrange(8 * len(data))
+    data[bit // 8] ^= 1 << bit % 8
+    path.unlink()  # not through the hard link of another artifact
+    path.write_bytes(data)
+
+
+def cut(path: Path) -> None:
+    data = path.read_bytes() or b"??"
+    path.unlink()
+    path.write_bytes(data[: len(data) // 2])
+
+
+def inside(artifact: Artifact) -> list[Path]:
+    """The files that make up the artifact: all but logs, which are for people."""
+    return sorted(path for path in artifact.path.rglob("*") if path.is_file() and path.parent.name != "logs")
+
+
+def mend(tmp_path: Path, artifact: Artifact) -> list[str]:
+    lines: list[str] = []
+    repair(Store(tmp_path / "store"), Artifact(artifact.path), 0, lines.append)
+    return lines
+
+
+def test_verify_deep_finds_every_flipped_bit_and_every_cut(run):
+    artifacts, _ = run()
+    for artifact in artifacts.values():
+        for path in inside(artifact):
+            whole = path.read_bytes()
+            for seed in range(12):
+                flip(path, seed)
+                assert Artifact(artifact.path).verify(deep=True), f"{path} with bit {seed}"
+                path.write_bytes(whole)
+            for size in (0, len(whole) // 2, len(whole) - 1):
+                if 0 <= size < len(whole):
+                    path.write_bytes(whole[:size])
+                    assert Artifact(artifact.path).verify(deep=True), f"{path} cut to {size}"
+            path.unlink()
+            assert Artifact(artifact.path).verify(deep=True), f"{path} missing"
+            path.write_bytes(whole)
+        assert not Artifact(artifact.path).verify(deep=True)
+
+
+@pytest.mark.parametrize("damage", [flip, cut, Path.unlink])
+@pytest.mark.parametrize("name", ["parts", "files/card.txt", "items.jsonl", "rejects.jsonl", "manifest.json", "draft.json"])
+def test_repair_ends_with_the_same_digest_and_computes_only_the_damaged_part(run, tmp_path, name, damage):
+    artifacts, _ = run()
+    artifact = artifacts["squares"]
+    computed(tmp_path)
+    path, group = artifact.part_of("n004")
+    damage(path if name == "parts" else artifact.path / name)
+    lines = mend(tmp_path, artifact)
+    found = computed(tmp_path)
+    if name == "parts":
+        assert found == [row.item for row in artifact.rows() if row.part == artifact.row("n004").part]
+        assert any("equal to before" in line for line in lines)
+    elif name != "items.jsonl":
+        assert found == []
+    mended = Store(tmp_path / "store").resolve("squares")
+    assert mended.digest == artifact.digest and mended.path == artifact.path
+    assert mended.verify(deep=True) == []
+    assert {path.name for path in (tmp_path / "store" / ".trash").iterdir()} > set()
+    assert [row.to_json() for row in mended.rows()] == [row.to_json() for row in artifact.rows()]
+    assert list((mended.path / "logs").iterdir())
+    assert not Store(tmp_path / "store").drafts()
+
+
+def test_one_damaged_row_costs_one_part(run, tmp_path):
+    artifacts, _ = run()
+    artifact = artifacts["squares"]
+    computed(tmp_path)
+    path = artifact.path / "items.jsonl"
+    lines = path.read_text().splitlines()
+    row = json.loads(lines[4])
+    row["members"]["square.txt"][0] += 1  # valid JSON, and wrong
+    path.write_text("\n".join([*lines[:4], json.dumps(row, sort_keys=True), *lines[5:], ""]))
+    mend(tmp_path, artifact)
+    assert computed(tmp_path) == sorted(r.item for r in artifact.rows() if r.part == row["part"])
+    assert Store(tmp_path / "store").resolve("squares").verify(deep=True) == []
+
+
+def test_rejects_survive_a_repair(run, tmp_path):
+    artifacts, _ = run()
+    artifact = artifacts["numbers"]
+    (reject,) = artifact.rejects()
+    for path in (artifact.path / "rejects.jsonl", artifact.part_of("n000")[0]):
+        flip(path)
+        mend(tmp_path, artifact)
+        mended = Store(tmp_path / "store").resolve("numbers")
+        assert (mended.rejects(), mended.digest) == ([reject], artifact.digest)
+
+
+def test_repair_says_so_where_the_result_is_another(run, tmp_path):
+    artifacts, _ = run(squares={"unsteady": True})
+    flip(artifacts["squares"].part_of("n004")[0])
+    lines = mend(tmp_path, artifacts["squares"])
+    assert any("DIFFERENT from before" in line and "later stages still hold" in line for line in lines)
+
+
+def test_a_run_stage_is_repaired_as_a_whole(run, tmp_path):
+    artifacts, _ = run()
+    cut(artifacts["total"].file("total.txt"))
+    lines = mend(tmp_path, artifacts["total"])
+    assert any("has no parts" in line for line in lines) and any("equal to before" in line for line in lines)
+
+
+def test_what_cannot_be_repaired_says_what_to_do(run, tmp_path):
+    artifacts, _ = run()
+    store, squares = Store(tmp_path / "store"), artifacts["squares"]
+    lines = mend(tmp_path, squares)
+    assert lines == [f"squares/{squares.path.name}: sound, nothing to repair"]
+    for name in ("manifest.json", "draft.json"):
+        flip(squares.path / name)
+    with pytest.raises(Damaged, match="delete the folder and run"):
+        repair(store, Artifact(squares.path), 0)
+    total = artifacts["total"]
+    cut(total.file("total.txt"))
+    (squares.path).rename(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="made from squares .*, which is gone"):
+        repair(store, Artifact(total.path), 0)
+
+
+def test_nothing_is_made_from_damaged_bytes(run, tmp_path):
+    """An input that changed on disk stops the run, which says what to do; an old artifact that gives nothing is passed over."""
+    artifacts, _ = run(stage="numbers")
+    numbers = artifacts["numbers"]
+    path, _ = numbers.part_of("n004")
+    data = path.read_bytes()
+    place, _ = numbers.row("n004").members["value.txt"]
+    path.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+    with pytest.raises(Damaged, match=f"changed at record n004; `lightmill repair numbers/{numbers.path.name}`"):
+        run()
+    grown, _ = run(stage="numbers", numbers={"n": 20})
+    fresh, _ = run(stage="numbers", numbers={"n": 20}, store=str(tmp_path / "fresh"))
+    assert grown["numbers"].digest == fresh["numbers"].digest
+    assert grown["numbers"].verify(deep=True) == []
+    mend(tmp_path, numbers)
+    assert run()[0]["total"] is not None
+
+
+def test_a_damaged_manifest_stops_only_who_needs_it(run, tmp_path, capsys):
+    artifacts, _ = run()
+    numbers = artifacts["numbers"]
+    flip(numbers.path / "manifest.json")
+    again, lines = run()
+    assert again["total"].digest == artifacts["total"].digest  # up to date, needs nothing
+    with pytest.raises(Damaged, match="lightmill repair"):
+        run(squares={"offset": 1})
+    store = ["--store", str(tmp_path / "store")]
+    parsed = parser().parse_args(["verify", "--deep", *store])
+    assert parsed.function(parsed) == Damaged.status
+    parsed = parser().parse_args(["ls", *store])
+    assert parsed.function(parsed) == 0
+    assert "damaged: `lightmill verify` says how" in capsys.readouterr().out
+    parsed = parser().parse_args(["repair", f"numbers/{numbers.path.name}", "--workers", "0", *store])
+    assert parsed.function(parsed) == 0
+    assert run(squares={"offset": 1})[0]["numbers"].digest == numbers.digest
+
+
+def parser():
+    import argparse
+
+    found = argparse.ArgumentParser()
+    commands.add_commands(found.add_subparsers(), "lightmill")
+    return found
+
+
+def test_damage_to_an_unfinished_artifact_is_made_good_by_the_next_run(run, tmp_path):
+    """Whatever file of a draft changes while nobody works on it: the next run ends as if nothing had happened."""
+    fine, _ = run(store=str(tmp_path / "fine"))
+    seen = set()
+    for seed in range(12):
+        store = tmp_path / f"store{seed}"
+        with pytest.raises(UserError, match="n013"):
+            run(store=str(store), numbers={"n": 15, "fail": ["n013"]})
+        files = sorted(path for path in store.glob("numbers/*.partial/**/*") if path.is_file() and path.parent.name != "logs")
+        path = files[seed % len(files)]
+        seen.add(path.parent.name)
+        (flip if seed % 3 else cut)(path)
+        artifacts, _ = run(store=str(store))
+        assert {name: a.digest for name, a in artifacts.items()} == {name: a.digest for name, a in fine.items()}
+        assert not [problem for artifact in artifacts.values() for problem in artifact.verify(deep=True)]
+    assert {"parts", "markers"} <= seen
