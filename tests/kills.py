@@ -51,7 +51,7 @@ MOMENTS = {  # pattern of what appears -> at most so many of them are waited for
     "{stage}/*.partial/items.jsonl": 1, "{stage}/*.partial/manifest.json": 1, "{stage}/*-*/manifest.json": 1,
 }  # fmt: skip
 KILLS_PER_ROUND = 6
-PATIENCE_S = 900.0  # no run here takes so long: one that does hangs
+PATIENCE_S = 3600.0  # no run here takes so long, even on a busy machine: one that does hangs
 
 
 @dataclass(frozen=True)
