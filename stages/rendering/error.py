@@ -25,25 +25,30 @@ HIGH = 0.8  # error of the large network over that of the small one, in the medi
 HOPE = 0.6  # least error of the large network over that of the small one
 
 
-def raw_error(a: ViewRecord, b: ViewRecord) -> float:
-    """Of the image with all lights on, not denoised, from the views of both halves."""
-    return 0.5 * log_error(a.image, b.image)
+class Judge:
+    """Tells the error of one view again and again, with more and more samples."""
+
+    def __init__(self, target: float, denoised: bool):
+        self.target, self.network = target, "fast" if denoised else None
+
+    def error(self, a: ViewRecord, b: ViewRecord, whole: ViewRecord) -> tuple[str | None, float]:
+        """(network, error) of the image with all lights on, from the views of both halves and of all samples, not denoised:
+        the small network where it meets the target, the large one otherwise, None where nothing is to be denoised."""
+        if self.network is None:
+            return None, 0.5 * log_error(a.image, b.image)
+        if self.network == "fast":
+            error = denoised_error(a, b, whole, "fast")
+            if error <= self.target:
+                return "fast", error
+            if HOPE * error > self.target:
+                return "high", error * HIGH
+            self.network = "high"  # if this does not do, the small one will not do with a few samples more
+        return "high", denoised_error(a, b, whole, "high")
 
 
 def denoised_error(a: ViewRecord, b: ViewRecord, whole: ViewRecord, quality: str) -> float:
-    """Of the image with all lights on, from the views of both halves and of all samples, not yet denoised."""
     first, second, now = (
         log_encode(denoise(v.image, v.albedo, v.normal, v.coverage, quality).astype(np.float64)) for v in (a, b, whole)
     )
     noise, drift = np.abs(first - second).mean(), np.abs((first + second) / 2 - now).mean()
     return float(QUALITIES[quality] * (NOISE_WEIGHT * noise + DRIFT_WEIGHT * drift))
-
-
-def cheapest(a: ViewRecord, b: ViewRecord, whole: ViewRecord, target: float) -> tuple[str, float]:
-    """(quality, error): the cheapest network that meets the target; the large one where none does."""
-    error = denoised_error(a, b, whole, "fast")
-    if error <= target:
-        return "fast", error
-    if HOPE * error > target:
-        return "high", error * HIGH
-    return "high", denoised_error(a, b, whole, "high")

@@ -22,7 +22,7 @@ from stages.exr import clamped_values
 from stages.records import SceneRecord, ViewRecord
 from stages.rendering import backend as backends
 from stages.rendering.denoising import denoise as denoise_layer
-from stages.rendering.error import cheapest, raw_error
+from stages.rendering.error import Judge
 from stages.rendering.sums import Sums
 
 MODES = ("physical", "cycles")
@@ -69,6 +69,7 @@ def render_views(
     total = max_spp // len(streams)  # of each stream
     step = min(FIRST_SPP // 2, total) if len(streams) > 1 else total
     parts: dict[int, list[Sums]] = {view: [] for view in active}  # per stream
+    judges = {view: Judge(target_error, denoise) for view in active}
     due = dict.fromkeys(active, 0.0)  # samples of a stream before which an estimate is not worth its cost
     while active:
         if taken:
@@ -87,7 +88,7 @@ def render_views(
             whole, *halves = (part.view(scene.object_index) for part in (sums, *mine))
             quality, error = "high" if denoise else None, None
             if len(halves) > 1:
-                quality, error = cheapest(*halves, whole, target_error) if denoise else (None, raw_error(*halves))
+                quality, error = judges[view].error(*halves, whole)
             if taken == total or error is None or error <= target_error:
                 records[view] = _finish(whole, sums, view, quality, error, len(streams) * taken - sums.spp)
                 del parts[view]
@@ -95,8 +96,8 @@ def render_views(
             left.append(view)
             if renderer.guided and taken == step and total >= 2 * taken and error > FAR * target_error:
                 parts[view] = []  # guided samples are so much better that these would only harm
-            else:  # no error falls faster than by the square root
-                due[view] = taken + ((error / target_error) ** 2 - 1) * mine[0].spp
+            else:  # no error falls faster than by the square root, and denoised ones do not reach it
+                due[view] = taken + ((error / target_error) ** (2.5 if denoise else 2.0) - 1) * mine[0].spp
         active, step = left, min(_next(taken) - taken, total - taken)
     return [records[view] for view in order]
 
