@@ -111,6 +111,8 @@ def open_pool(workers: int, threads: int) -> Iterator[ProcessPool]:
             pool.close()
         except BaseException:
             pool.stop()
+            for process in multiprocessing.active_children():  # parts are safe from kills, and a polite end takes seconds
+                process.kill()
             raise
         finally:
             pool.join()

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any, BinaryIO, overload
 
 # a line's beginning, as ``json_line`` writes a row: keys are sorted, and an id has nothing to escape
-_ID = re.compile(rb'\{"digest": "[0-9a-f]*", "group": "(?:[^"\\]|\\.)*", "id": "([A-Za-z0-9_-]+)", ')
+_DIGEST = b'{"digest": "'
+_ID = re.compile(rb'\{"digest": "[0-9a-f]{64}", "group": "(?:[^"\\]|\\.)*", "id": "([A-Za-z0-9_-]+)", ')
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +88,11 @@ class Listing(Sequence[Row]):
 
     def holds(self, record_id: str) -> bool:
         return record_id in self._lines[1]
+
+    def digest(self, record_id: str) -> str:
+        """The record's digest, which its line begins with; KeyError if there is none."""
+        start = self._lines[0][self._lines[1][record_id]]
+        return os.pread(self._file.fileno(), len(_DIGEST) + 64, start)[len(_DIGEST) :].decode()
 
     def find(self, record_id: str) -> Row:
         """The record's row; KeyError if there is none."""

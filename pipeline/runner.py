@@ -36,7 +36,7 @@ from pipeline.errors import (
     status_of,
 )
 from pipeline.executor import run_parts
-from pipeline.keys import SCHEME, canonical, digest_of
+from pipeline.keys import SCHEME, canonical, digest_of, digest_of_plain
 from pipeline.progress import Progress, duration
 from pipeline.stage import Item, MapStage, RunStage, Stage, System, load_system
 from pipeline.status import RunState
@@ -143,8 +143,8 @@ def item_keys(planned: Planned, items: Sequence[Item], inputs: Mapping[str, Arti
     for item in items:
         needs: Any = whole
         if item.needs is not None:
-            needs = [[name, record, inputs[name].row(record).digest] for name, record in item.needs]
-        keys.append(digest_of({"base": base, "item": item.id, "source": sources.get(item.id), "needs": needs}))
+            needs = [[name, record, inputs[name].digest_of(record)] for name, record in item.needs]
+        keys.append(digest_of_plain({"base": base, "item": item.id, "source": sources.get(item.id), "needs": needs}))
     return keys
 
 
@@ -466,7 +466,9 @@ def _run_map(
             f"{planned.name}: {len(failed)} item(s) failed: {names}. The first: {last}. Its traceback: {log} "
             "(`lightmill status` names the others'). Everything else is kept; run again to continue"
         )
-    draft.use_parts(_finished(planned.name, draft, parts))
+    part_keys = list(parts)
+    del items, keys, parts, markers  # there may be millions, and what follows needs the room
+    draft.use_parts(_finished(planned.name, draft, part_keys))
     _check_rejects(planned, stage, draft, total)
     for path in sorted(draft.files.rglob("*"), reverse=True):  # what an interrupted finish left
         path.unlink() if path.is_file() else path.rmdir()

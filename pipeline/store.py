@@ -81,6 +81,13 @@ class _Records:
         except KeyError:
             raise UserError(f"there is no record {record_id!r} in {self.path}") from None
 
+    def digest_of(self, record_id: str) -> str:
+        """The digest of a record, without parsing its row."""
+        try:
+            return self.rows().digest(record_id)
+        except KeyError:
+            raise UserError(f"there is no record {record_id!r} in {self.path}") from None
+
     def ids(self, group: str | None = None) -> list[str]:
         return [row.id for row in self.rows() if group is None or row.group == group]
 

@@ -19,6 +19,7 @@ import contextlib
 import json
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -49,7 +50,8 @@ MOMENTS = {  # pattern of what appears -> at most so many of them are waited for
     "{stage}/*.partial": 1, "{stage}/*.partial/markers/[!.]*.json": 4, "{stage}/*.partial/parts/*.tar": 4,
     "{stage}/*.partial/items.jsonl": 1, "{stage}/*.partial/manifest.json": 1, "{stage}/*-*/manifest.json": 1,
 }  # fmt: skip
-PATIENCE_S = 900.0  # no run here takes so long: one that does hangs
+KILLS_PER_ROUND = 6
+PATIENCE_S = 3600.0  # no run here takes so long, even on a busy machine: one that does hangs
 
 
 @dataclass(frozen=True)
@@ -254,9 +256,9 @@ class Striker:
         run = Run(self.campaign, store)
         try:
             if may_kill and run.begin():
-                if self.random.random() < 0.4 and "train" not in self.campaign.stages:
-                    self.strike(run, worker=True)
-                if self.random.random() < 0.8 and self.strike(run, worker=False):
+                to_worker = self.random.random() < 0.4 and "train" not in self.campaign.stages
+                struck = to_worker and self.strike(run, worker=True)
+                if (not struck or self.random.random() < 0.5) and self.strike(run, worker=False):
                     return None
             status = run.end()
         finally:
@@ -271,7 +273,7 @@ class Striker:
         began = time.monotonic()
         left = self.work_s * self.left(run.store)
         if self.random.random() < 0.5:
-            delay = self.random.uniform(0, left)
+            delay = self.random.uniform(0, 0.9 * left)
             aim = f"after {delay:.2f} s"
             arrived = run.wait_until(lambda: time.monotonic() - began > delay)
         else:
@@ -289,17 +291,16 @@ class Striker:
             aim = f"at {moment}"
         if worker:
             run.wait_until(lambda: bool(run.workers()), 0.01)
-        targets = run.workers() if worker else [psutil.Process(run.process.pid)] if arrived else []
-        if not arrived or not targets:
+        targets = run.workers() if worker else [run.process]
+        if not arrived or not targets or run.process.poll() is not None:
             return False
         place = where(run.store)
-        target = self.random.choice(targets)
         with contextlib.suppress(psutil.Error):
-            target.kill()
+            self.random.choice(targets).kill()
+        if not worker and run.process.wait() != -signal.SIGKILL:  # it ended just before
+            return False
         self.check_kept(run.store)
         self.kept = finished(run.store)
-        if not worker:
-            run.process.wait()
         who = "worker" if worker else "runner"
         self.tally.kills += 1
         self.tally.struck[place, who] += 1
@@ -352,7 +353,7 @@ def main(words: Sequence[str] | None = None) -> int:
         striker = Striker(campaign, calm, Path(folder) / "killed", arguments.seed, work_s)
         tally = striker.tally
         while tally.kills < arguments.kills and not tally.wrong:
-            striker.round(min(4, arguments.kills - tally.kills))
+            striker.round(min(KILLS_PER_ROUND, arguments.kills - tally.kills))
         elapsed = time.monotonic() - began
         print(f"\n{'struck':<40} {'runner':>7} {'worker':>7}")
         for place in sorted({place for place, _ in tally.struck}):

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import random
-import signal
-import subprocess
-import sys
 import tarfile
 import time
 from pathlib import Path
@@ -189,26 +184,6 @@ def test_a_bug_in_one_item_fails_its_part_and_keeps_the_others(run, tmp_path):
     assert len(list((draft / "markers").iterdir())) == 3  # of 4 parts
     _, lines = run()
     assert "6 of them already there" in " ".join(lines)
-
-
-def test_killed_runs_end_with_the_digests_of_an_undisturbed_one(run, tmp_path):
-    config = {
-        "system": "tests.pipeline.toy", "stage": "total", "store": str(tmp_path / "killed"), "workers": 2,
-        "numbers": {"n": 24, "pause_s": 0.05}, "squares": {}, "total": {},
-    }  # fmt: skip
-    command = [sys.executable, "-m", "tests.pipeline.toy_main", json.dumps(config)]
-    delays = random.Random(7)
-    for _ in range(6):
-        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(delays.uniform(0.4, 1.4))
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-    undisturbed, _ = run(numbers={"n": 24})
-    store = Store(tmp_path / "killed")
-    assert {a.stage: a.digest for a in store.artifacts()} == contents(undisturbed)
-    assert not store.drafts()
-    assert not [problem for artifact in store.artifacts() for problem in artifact.verify(deep=True)]
 
 
 # -- the store

@@ -114,7 +114,7 @@ def test_a_second_run_starts_from_the_first_ones_weights(trained, shard, tmp_pat
 
 
 def test_killed_at_any_step_and_resumed_is_the_same_run(shard, tmp_path, monkeypatch):
-    """Through the real loader; tests/resume.py does it with real kills."""
+    """Through the real loader; tests/kills.py does it with real kills."""
     import stages.dataset
 
     settings = {"steps": 9, "checkpoint_every": 4, "log_every": 1, "relight": True, "mirror": True, "ema": 0.9}
