@@ -208,13 +208,10 @@ def command_status(store: Store, arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(states, indent=1))
         return 0
-    made = {artifact.stage: artifact.manifest["finished"] for artifact in store.artifacts()}
     for state in states:
-        print("\n".join(lines(state, made)))
+        print("\n".join(lines(state)))
     if not states:
-        newest = max(made.values(), default=None)
-        when = f"; the newest artifact was made {duration(time.time() - newest)} ago" if newest else ""
-        print(f"nothing is running or unfinished in {store.root}{when}")
+        print(f"nothing is running or unfinished in {store.root}")
     return 0
 
 

@@ -11,7 +11,7 @@ import json
 import os
 import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +65,7 @@ class RunState:
 def read_states(store: Store, stage: str | None = None) -> list[dict[str, Any]]:
     """One plain dict per draft of the store, the one that changed last at the end.
 
-    ``state``: running, waiting for items (``items``: who does what for how long), stopped (a message says why) or dead.
+    ``state``: running (``items``: which process is at what, and for how long), stopped (``message`` says why) or dead.
     """
     found = []
     for path in store.drafts():
@@ -97,8 +97,8 @@ def _read(path: Path) -> dict[str, Any]:
         return {}
 
 
-def lines(state: Mapping[str, Any], made: Sequence[str] = ()) -> list[str]:
-    """A draft's state for people; ``made``: stages of its plan that are in the store by now."""
+def lines(state: Mapping[str, Any]) -> list[str]:
+    """A draft's state for people."""
     clock = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(state["changed"]))
     holder = state["holder"] or {}
     what = {
@@ -112,7 +112,8 @@ def lines(state: Mapping[str, Any], made: Sequence[str] = ()) -> list[str]:
         out.append(f"  {name:<9} {text}")
 
     if state.get("plan"):
-        marks = ["done" if name in made else state["state"] if name == state["stage"] else "to come" for name in state["plan"]]
+        at = state["plan"].index(state["stage"])  # the plan is in running order
+        marks = ["done"] * at + [state["state"]] + ["to come"] * (len(state["plan"]) - at - 1)
         add("stages", ", ".join(f"{name} {mark}" for name, mark in zip(state["plan"], marks, strict=True)))
     if state.get("parts"):
         rate = (state["done"] - state["reused"]) / state["seconds"] if state["seconds"] else 0.0

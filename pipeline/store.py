@@ -339,7 +339,7 @@ class Draft(_Records):
 
     def sweep(self) -> None:
         """Delete what workers that were killed left half written. Only for who holds the claim."""
-        for pattern in ("parts/.*.tmp", "markers/.*.tmp", ".*.tmp", "running/*"):
+        for pattern in ("parts/.*.tmp", "markers/.*.tmp", ".*.tmp", "running/*.json"):
             for path in self.path.glob(pattern):
                 path.unlink(missing_ok=True)
 
