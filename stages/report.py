@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pipeline.store import Artifact, Store
     from stages.evaluation.report import Probe, Run
 
-PROBE_FIELDS = ("title", "question", "setting", "model", "columns", "rows", "notes")  # of probe.json, that the page shows
+PROBE_FIELDS = ("name", "title", "question", "setting", "model", "columns", "rows", "notes")  # of probe.json
 
 
 def write_report(
@@ -38,7 +38,7 @@ def write_report(
     if not out.parent.is_dir():
         raise UserError(f"{out.parent} is not a folder: make it first")
     runs, probes = load(words, store)
-    if len(runs) > 1 and not different_data:
+    if not different_data:
         check_same(runs)
     page = report.page(runs, probes, gallery, title)
     made = {
@@ -95,7 +95,7 @@ def load_probe(artifact: Artifact) -> Probe:
         raise UserError(
             f"{artifact.path.name}: files/probe.json has no {', '.join(missing)}: make the probe again (force=probe)"
         )
-    return Probe(artifact.key, facts, artifact.file("figure.png"), artifact.file("table.md").read_text())
+    return Probe(artifact.key, facts, artifact.file("figure.png"))
 
 
 def check_same(runs: Sequence[Run]) -> None:

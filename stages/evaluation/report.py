@@ -60,7 +60,6 @@ class Probe:
     key: str
     facts: Mapping[str, Any]
     figure: Path
-    markdown: str
 
 
 def picture_uri(data: bytes) -> str:
@@ -147,11 +146,15 @@ def ceiling_lines(summary: Mapping[str, Any]) -> list[str]:
         text = f"{metric.label}: the noiseless truth would score " + f"{mean} {metric.unit}".rstrip()
         source = {"pairs": "rendered twice", "estimates": "by the renderer's own estimate"}[ceiling["from"]]
         text += f" (95 % interval {low} to {high}; {ceiling['views']} views of {ceiling['of']}, {source})"
-        if name == "psnr":
-            share = 10 ** ((summary["methods"]["model"][name]["mean"] - ceiling["mean"]) / 10)
-            text += f"; at these means noise makes {100 * share:.2g} % of the model's squared error"
         lines.append(text + ".")
     return lines or ["No view of the data was rendered twice and none has an error estimate: the ceiling is unknown."]
+
+
+def noise_share(summary: Mapping[str, Any]) -> float | None:
+    """The noise's share of the model's squared error, told from mean PSNR and its ceiling; None where that is unknown."""
+    if "psnr" not in summary["ceiling"]:
+        return None
+    return 10 ** ((summary["methods"]["model"]["psnr"]["mean"] - summary["ceiling"]["psnr"]["mean"]) / 10)
 
 
 def columns(runs: Sequence[Run]) -> list[dict[str, Any]]:
@@ -200,6 +203,11 @@ def same_scenes(runs: Sequence[Run]) -> set[str]:
     return {id for id, target in runs[0].targets.items() if all(run.targets.get(id) == target for run in runs)}
 
 
+def all_same(runs: Sequence[Run]) -> bool:
+    """Whether all runs were evaluated on the same scenes, and on no others."""
+    return all(run.targets == runs[0].targets for run in runs)
+
+
 def differences(runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
     """Name -> how much better that run is than the first (`statistics.difference`), over the scenes that all have in common."""
     same = same_scenes(runs)
@@ -243,10 +251,10 @@ def markdown(summary: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _cell(metric: Metric, value: Mapping[str, float] | None, bold: bool) -> str:
+def _cell(metric: Metric, value: Mapping[str, float] | None, bold: bool, sign: str = "") -> str:
     if value is None:
         return "–"
-    mean, low, high = told(metric, value)
+    mean, low, high = told(metric, value, sign)
     return f"**{mean}** [{low}, {high}]" if bold else f"{mean} [{low}, {high}]"
 
 
@@ -256,21 +264,27 @@ def side_by_side(runs: Sequence[Run], probes: Sequence[Probe]) -> str:
     if runs:
         metrics = metrics_of([run.summary for run in runs])
         table = [column for column in columns(runs) if column["values"]]
-        best = best_of(table, metrics)
+        best = best_of(table, metrics) if all_same(runs) else dict.fromkeys(metrics)
         lines = ["Mean over views [95 % interval over scenes]", ""]
         lines += ["| metric | " + " | ".join(column["label"] for column in table) + " |", "| --- |" + " ---: |" * len(table)]
         for name, metric in metrics.items():
             cells = [_cell(metric, column["values"].get(name), best[name] == i) for i, column in enumerate(table)]
             lines.append(f"| {metric.heading} | " + " | ".join(cells) + " |")
         found = differences(runs)
-        for name, row in found.items():
-            lines += ["", f"{name} against {runs[0].name}, view by view ({row['scenes']} scenes, {row['views']} views):", ""]
-            for metric, gain in row["gains"].items():
-                mean, low, high = told(metrics[metric], gain, "+")
-                lines.append(f"- {metrics[metric].label}: {mean} {metrics[metric].unit}".rstrip() + f" better [{low}, {high}]")
+        if found:
+            first = next(iter(found.values()))
+            paired = f"paired over {first['views']} views of {first['scenes']} scenes"
+            lines += ["", f"How much better than {runs[0].name}, {paired} (positive is better)", ""]
+            lines += ["| metric | " + " | ".join(found) + " |", "| --- |" + " ---: |" * len(found)]
+            for name, metric in metrics.items():
+                cells = [_cell(metric, row["gains"].get(name), False, "+") for row in found.values()]
+                lines.append(f"| {metric.label}{f' ({metric.unit})' if metric.unit else ''} | " + " | ".join(cells) + " |")
     for probe in probes:
-        lines += ["", f"### {probe.facts['title']}", "", probe.facts["question"], "", probe.markdown.strip()]
-        lines += ["", *(f"- {note}" for note in probe.facts["notes"])] if probe.facts["notes"] else []
+        facts = probe.facts
+        lines += ["", f"### {facts['title']}", "", facts["question"], ""]
+        lines += ["| " + " | ".join(facts["columns"]) + " |", "| --- |" + " ---: |" * (len(facts["columns"]) - 1)]
+        lines += ["| " + " | ".join("–" if cell is None else str(cell) for cell in row) + " |" for row in facts["rows"]]
+        lines += ["", *(f"- {note}" for note in facts["notes"])] if facts["notes"] else []
     return "\n".join(lines).strip() + "\n"
 
 
@@ -319,10 +333,16 @@ def timing_rows(runs: Sequence[Run]) -> list[dict[str, Any]]:
     rows = [{"label": label, "kind": kinds[step], "ms": of([step])} for step, label in STEPS.items()]
     rows.append({"label": "first image of a scene", "kind": "sum", "ms": of(list(STEPS))})
     rows.append({"label": "every further image", "kind": "sum", "ms": of(PER_IMAGE)})
-    rows.append({"label": "share of the view-independent part in the first", "kind": "share", "ms": of(once)})
+    rows.append({"label": "share of the per-scene part in the first", "kind": "share", "ms": of(once)})
     total = rows[-3]["ms"]
     rows[-1]["ms"] = [part / whole if part is not None else None for part, whole in zip(rows[-1]["ms"], total, strict=True)]
     return rows
+
+
+def _grouped(texts: Sequence[str], runs: Sequence[Run]) -> dict[str, str]:
+    """Text -> the names of the runs of which it is true; "" where it is of all."""
+    names = {text: [run.name for run, own in zip(runs, texts, strict=True) if own == text] for text in texts}
+    return {text: "" if len(names) == 1 else ", ".join(found) for text, found in names.items()}
 
 
 def page(runs: Sequence[Run], probes: Sequence[Probe] = (), limit: int = 24, title: str | None = None) -> str:
@@ -337,7 +357,7 @@ def page(runs: Sequence[Run], probes: Sequence[Probe] = (), limit: int = 24, tit
     metrics = metrics_of(summaries)
     table = columns(runs) if runs else []
     rows, views = gallery(runs, limit) if runs else ([], 0)
-    same = len(runs) < 2 or len(same_scenes(runs)) == len(runs[0].targets) == max(len(run.targets) for run in runs)
+    same = all_same(runs)
     named_runs = {run.name: run.summary for run in runs}
     return environment.get_template("report.html.j2").render(
         title=title or ("How close the model comes to the path tracer" if len(runs) == 1 else "Models side by side"),
@@ -347,10 +367,11 @@ def page(runs: Sequence[Run], probes: Sequence[Probe] = (), limit: int = 24, tit
         shown=[name for name in SHOWN if name in metrics],
         judged=JUDGED,
         table=table,
-        best=best_of(table, metrics) if runs else {},
+        best=best_of(table, metrics) if runs and same else dict.fromkeys(metrics),
         told=told,
         verdicts=[verdicts(summary) for summary in summaries],
-        ceilings=[ceiling_lines(summary) for summary in summaries],
+        ceilings=_grouped([" ".join(ceiling_lines(summary)) for summary in summaries], runs),
+        shares=[(run.name, share) for run in runs if (share := noise_share(run.summary)) is not None],
         differences=differences(runs) if len(runs) > 1 else {},
         unlike=unlike(runs) if len(runs) > 1 else {},
         breakdowns=BREAKDOWNS,
@@ -366,7 +387,7 @@ def page(runs: Sequence[Run], probes: Sequence[Probe] = (), limit: int = 24, tit
                 "facts": probe.facts,
                 "key": probe.key,
                 "figure": picture_uri(probe.figure.read_bytes()),
-                "model": ", ".join(f"{name} {value}" for name, value in flatten(probe.facts["model"])),
+                "model": ", ".join(f"{name} {value[:12]}" for name, value in flatten(probe.facts["model"])),
             }
             for probe in probes
         ],

@@ -147,10 +147,10 @@ def difference(
 ) -> dict[str, Any] | None:
     """How much better one run's model is than another's, ``{"scenes", "views", "gains": {metric: bootstrap}}``.
 
-    Paired view by view over the scenes ``same``, which both have rendered from the same data; None where there is none.
-    Positive is better whatever the metric.
+    Paired view by view over the scenes ``same``, whose data is the same for both; None where they are fewer than two, which
+    would say nothing of a third. Positive is better whatever the metric.
     """
-    if not same:
+    if len(same) < 2:
         return None
     pairs = [sorted((scene for scene in run if scene["id"] in same), key=lambda scene: scene["id"]) for run in (ours, theirs)]
     gains = {name: _gain(metric, *(_column(run, "model", name) for run in pairs)) for name, metric in metrics.items()}
