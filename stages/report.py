@@ -18,9 +18,7 @@ from pipeline.files import write_atomic
 
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Store
-    from stages.evaluation.report import Probe, Run
-
-PROBE_FIELDS = ("name", "title", "question", "setting", "model", "columns", "rows", "notes")  # of probe.json
+    from stages.evaluation.runs import Probe, Run
 
 
 def write_report(
@@ -31,7 +29,7 @@ def write_report(
     words: artifacts as ``Store.resolve`` takes them, or ``NAME=KEY`` with the name that the page shall use. gallery: at most so
     many views are shown. different_data: show runs together that were evaluated on different scenes.
     """
-    from stages.evaluation import report
+    from stages.evaluation import report, tables
 
     if out.suffix.lower() != ".html":
         raise UserError(f"{out}: the page must end in .html; the JSON and the Markdown lie beside it")
@@ -43,8 +41,8 @@ def write_report(
     page = report.page(runs, probes, gallery, title)
     made = {
         out: page,
-        out.with_suffix(".json"): json.dumps(report.numbers(runs, probes), indent=1, allow_nan=False) + "\n",
-        out.with_suffix(".md"): report.side_by_side(runs, probes),
+        out.with_suffix(".json"): json.dumps(tables.numbers(runs, probes), indent=1, allow_nan=False) + "\n",
+        out.with_suffix(".md"): tables.side_by_side(runs, probes),
     }
     for path, text in made.items():
         write_atomic(path, text.encode())
@@ -53,7 +51,7 @@ def write_report(
 
 def load(words: Sequence[str], store: Store) -> tuple[list[Run], list[Probe]]:
     """Runs and probes in the order in which they were given."""
-    from stages.evaluation.runs import load_run
+    from stages.evaluation.runs import load_probe, load_run
 
     given: list[tuple[str, Artifact]] = []
     for word in words:
@@ -84,18 +82,6 @@ def default_names(evaluated: Sequence[tuple[str, Artifact]], store: Store) -> li
         return folders
     short = [folder.rpartition("-")[0] or folder for folder in folders]
     return [name if short.count(name) == 1 else folder for name, folder in zip(short, folders, strict=True)]
-
-
-def load_probe(artifact: Artifact) -> Probe:
-    from stages.evaluation.report import Probe
-
-    facts = json.loads(artifact.file("probe.json").read_bytes())
-    missing = [name for name in PROBE_FIELDS if name not in facts]
-    if missing:
-        raise UserError(
-            f"{artifact.path.name}: files/probe.json has no {', '.join(missing)}: make the probe again (force=probe)"
-        )
-    return Probe(artifact.key, facts, artifact.file("figure.png"))
 
 
 def check_same(runs: Sequence[Run]) -> None:

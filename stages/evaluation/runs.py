@@ -1,19 +1,55 @@
-"""Evaluated models as the report shows them (`Run`), from an artifact of *evaluate*, finished or in the making."""
+"""What a report shows: evaluated models (`Run`), from artifacts of *evaluate*, finished or in the making, and probes."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.store import history
 
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Draft, Store
-    from stages.evaluation.report import Images, Run
 
+PROBE_FIELDS = ("name", "title", "question", "setting", "model", "columns", "rows", "notes")  # of probe.json
 CONFIGS = ("collect", "scene", "render", "train", "evaluate")  # stages whose settings the page shows
+
+
+Images = Mapping[str, np.ndarray]  # target, prediction, direct: (H, W, 3) linear radiance
+
+
+@dataclass(frozen=True)
+class Run:
+    """One evaluated model.
+
+    summary: what metrics.json holds. timing: what timing.json holds, or None. facts: label -> text. configs: stage -> resolved
+    config. log: rows of the training log. images: (scene id, camera) -> its `Images`. targets: scene id -> the digest of its
+    data, by which runs on the same scenes are told.
+    """
+
+    name: str
+    key: str
+    summary: Mapping[str, Any]
+    timing: Mapping[str, Any] | None = None
+    facts: Mapping[str, str] = field(default_factory=dict)
+    configs: Mapping[str, Any] = field(default_factory=dict)
+    log: Sequence[Mapping[str, Any]] = ()
+    images: Callable[[str, int], Images] | None = None
+    targets: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One artifact of stage *probe*: a question put to a model, and what came out. ``facts``: its probe.json."""
+
+    key: str
+    facts: Mapping[str, Any]
+    figure: Path
 
 
 def run_of(
@@ -26,7 +62,6 @@ def run_of(
     train: Artifact | None,
 ) -> Run:
     """``params``: the config of *evaluate*. Without its shards a run has no pictures, without *train* no loss curve."""
-    from stages.evaluation.report import Run
     from stages.exr import decode_rgb, decode_view, view_members
 
     def images(scene_id: str, camera: int) -> Images:
@@ -49,11 +84,16 @@ def run_of(
         summary=summary,
         timing=timing,
         facts=facts(summary, evaluated.key),
-        configs={stage: found[stage] for stage in CONFIGS if stage in found},
+        configs={stage: _settings(found[stage]) for stage in CONFIGS if stage in found},
         log=[json.loads(line) for line in log if line],
         images=images,
         targets={id: shard.row(id).digest if shard is not None else data for id in scenes},
     )
+
+
+def _settings(params: Mapping[str, Any]) -> dict[str, Any]:
+    """Without the hashes of source files, of which there may be thousands."""
+    return {name: value for name, value in params.items() if name != "identity"}
 
 
 def load_run(artifact: Artifact, store: Store, name: str) -> Run:
@@ -76,6 +116,17 @@ def load_run(artifact: Artifact, store: Store, name: str) -> Run:
         store.find("shard", preimage["inputs"]["shard"]),
         store.find("train", preimage["inputs"]["train"]),
     )
+
+
+def load_probe(artifact: Artifact) -> Probe:
+    """The probe of a finished artifact."""
+    facts = json.loads(artifact.file("probe.json").read_bytes())
+    missing = [name for name in PROBE_FIELDS if name not in facts]
+    if missing:
+        raise UserError(
+            f"{artifact.path.name}: files/probe.json has no {', '.join(missing)}: make the probe again (force=probe)"
+        )
+    return Probe(artifact.key, facts, artifact.file("figure.png"))
 
 
 def facts(summary: Mapping[str, Any], key: str) -> dict[str, str]:

@@ -20,7 +20,6 @@ from stages.dataset.encoding import encode_scene
 from stages.evaluation.baselines import best_constants, mean_images, measure_baseline
 from stages.evaluation.ceiling import ceiling, noise_pairs
 from stages.evaluation.plots import loss_curves
-from stages.evaluation.report import markdown
 from stages.evaluation.runs import facts
 from stages.evaluation.statistics import (
     BARS,
@@ -33,6 +32,7 @@ from stages.evaluation.statistics import (
     summarise,
     worst_first,
 )
+from stages.evaluation.tables import markdown
 from stages.exr import decode_rgb, encode_view
 from stages.metrics import METRICS, log_error, measure_all
 from stages.records import SceneRecord, ViewRecord
