@@ -86,8 +86,8 @@ def default_names(evaluated: Sequence[tuple[str, Artifact]], store: Store) -> li
 
 def check_same(runs: Sequence[Run]) -> None:
     """UserError unless all runs were evaluated on the same scenes."""
-    first = runs[0]
     for run in runs[1:]:
+        first = runs[0]
         if run.targets != first.targets:
             shared = sum(run.targets.get(id) == target for id, target in first.targets.items())
             said = [

@@ -137,6 +137,12 @@ def test_runs_and_probes_on_one_page(store, factor, tmp_path):
     assert "| 8 | – |" in table
 
 
+def test_a_page_may_hold_probes_alone(store, tmp_path):
+    write_report([probe(store).key], store, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "How many lights are too many?" in page and "Gallery" not in page and page.count("<img") == 1
+
+
 def test_runs_on_different_scenes_are_refused_unless_asked(store, factor, tmp_path):
     one = evaluated(store, "one", shard_of(store), factor, 0.9)
     more = dataset_inputs(tmp_path / "more", train=3, test=3)
