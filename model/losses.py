@@ -88,7 +88,8 @@ class LPIPS(nn.Module):
             path = None if folder is None else Path(folder) / name
             if path is None or not path.is_file():
                 where = f"no folder is named (lpips_folder, or {FOLDER_VARIABLE})" if path is None else f"{path} does not exist"
-                raise ValueError(f"LPIPS needs {name}, but {where}: get it from {url}, or train without it: lpips=0")
+                without = "go without: train.lpips=0, evaluate.lpips=none"
+                raise ValueError(f"LPIPS needs {name}, but {where}: get it from {url}, or {without}")
             loaded.append(torch.load(path, map_location="cpu", weights_only=True))
         features, linear = loaded
         metric = cls(network)

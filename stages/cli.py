@@ -115,6 +115,22 @@ def command_import(arguments: argparse.Namespace) -> int:
     return run_main([*words, *(["--debug"] if arguments.debug else [])])
 
 
+def command_report(arguments: argparse.Namespace) -> int:
+    from pipeline.store import Store
+    from stages.report import write_report
+
+    for path in write_report(
+        arguments.keys,
+        Store(arguments.store),
+        Path(arguments.out),
+        gallery=arguments.gallery,
+        different_data=arguments.different_data,
+        title=arguments.title,
+    ):
+        print(path)
+    return 0
+
+
 def view_argument(text: str) -> int | str:
     if text == "all":
         return text
@@ -183,6 +199,17 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("a", help="reference: .exr or .png")
     sub.add_argument("b", help="test image of the same size")
     sub.add_argument("--json", action="store_true", help="print JSON")
+
+    sub = add(
+        "report", command_report, "runs side by side, and probes, on one HTML page (with JSON and Markdown beside it)",
+        "small=evaluate/test-0123456789ab tiny=evaluate/test-ba9876543210 -o ablation.html",
+    )  # fmt: skip
+    sub.add_argument("keys", nargs="+", metavar="KEY", help="artifacts of evaluate and probe, or NAME=KEY with a name to show")
+    sub.add_argument("-o", "--out", required=True, help="the page, .html")
+    sub.add_argument("--gallery", type=int, default=24, help="views shown, evenly spaced from worst to best (default: 24)")
+    sub.add_argument("--different-data", action="store_true", help="also runs that were evaluated on different scenes")
+    sub.add_argument("--title", help="the page's title")
+    sub.add_argument("--store", default="store", help="the store's folder (default: store)")
     for sub in parsers.choices.values():
         sub.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show the traceback of an error")
     return parser

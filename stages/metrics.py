@@ -6,7 +6,7 @@
 | psnr_tm, ssim_tm | the same | ``log10(1 + x) / log10(2)``, clamped to [0, 1] | higher |
 | log_error | mean absolute difference of ``log10(1 + x)`` (the paper's L1 loss) | HDR | lower |
 | flip | mean HDR-FLIP error, NVIDIA's own package, its default viewing conditions | HDR | lower |
-| lpips_vgg | LPIPS with VGG16, only where its weights are given | as psnr_tm | lower |
+| lpips_vgg, lpips_alex | LPIPS with that network, only where its weights are given | as psnr_tm | lower |
 
 Each metric says in which `space` its best constant has a closed form, if in any, so that a baseline
 (``stages.evaluation.baselines``) can be the strongest of its kind for that very metric. Paper: section 4.1, table 1.
@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipeline.errors import UserError
 from stages.tonemap import LUMINANCE, clamp, log_encode, tone_map
 
 PSNR_MAX = 100.0  # dB; equal images would have infinitely many, which neither JSON nor an average can hold
@@ -115,10 +116,13 @@ METRICS: Mapping[str, Metric] = {
 }
 
 
+LPIPS_NETWORKS = {"vgg": "LPIPS (VGG)", "alex": "LPIPS (AlexNet)"}
+
+
 def with_lpips(network: str, folder: str | None) -> dict[str, Metric]:
     """`METRICS` and, unless ``network`` is "none", LPIPS with that network ("vgg" or "alex") on tone-mapped values.
 
-    The weights in ``folder`` are read at the first use.
+    The weights in ``folder`` are read at the first use; a UserError says where they can be had.
     """
     if network == "none":
         return dict(METRICS)
@@ -127,7 +131,10 @@ def with_lpips(network: str, folder: str | None) -> dict[str, Metric]:
     def load() -> Any:
         from model.losses import LPIPS
 
-        return LPIPS.load(None if folder is None else Path(folder), network)
+        try:
+            return LPIPS.load(None if folder is None else Path(folder), network)
+        except ValueError as error:
+            raise UserError(str(error)) from None
 
     def measure(reference: np.ndarray, test: np.ndarray) -> float:
         import torch
@@ -136,8 +143,15 @@ def with_lpips(network: str, folder: str | None) -> dict[str, Metric]:
         with torch.no_grad():
             return float(load()(*images))
 
-    label = {"vgg": "LPIPS (VGG)", "alex": "LPIPS (AlexNet)"}[network]
-    return {**METRICS, f"lpips_{network}": Metric(f"lpips_{network}", label, "", False, 4, None, measure)}
+    name = f"lpips_{network}"
+    return {**METRICS, name: Metric(name, LPIPS_NETWORKS[network], "", False, 4, None, measure)}
+
+
+def named(names: Iterable[str]) -> dict[str, Metric]:
+    """The metrics of these names, in the order of their definition; their weights may be elsewhere, `format` needs none."""
+    wanted = set(names)
+    known = {name: metric for network in ("none", *LPIPS_NETWORKS) for name, metric in with_lpips(network, None).items()}
+    return {name: metric for name, metric in known.items() if name in wanted}
 
 
 def check_pair(reference: np.ndarray, test: np.ndarray) -> None:

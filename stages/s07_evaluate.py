@@ -1,11 +1,13 @@
 """evaluate: how well the model renders scenes that it has never seen, against baselines that deserve the name.
 
 Reads *shard* (held-out scenes with their path-traced views; training views for the mean image) and *train* (checkpoint,
-loss log). Writes one record per scene, ``metrics.json`` (every metric of every method and view) and one half-float EXR
-per view with the prediction, and ``files/``: report.html, metrics.json, metrics.md, overview.png.
+loss log). Writes one record per scene, ``metrics.json`` (every metric of every method and view, and what the view shows) and
+one half-float EXR per view with the prediction, and ``files/``: report.html, metrics.json, metrics.md, timing.json,
+overview.png.
 
 One design choice: a record holds all that the report says about its scene, so that the report is only statistics and
-pictures. Paper: section 4.1, table 1.
+pictures. Times, which are never the same twice, are measured at the end and stay out of records and digest. Paper: section
+4.1, tables 1 and 2.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.store import Artifact, Draft
+    from stages.records import SceneRecord
 
 
 class EvaluateConfig(StageConfig):
@@ -37,6 +40,7 @@ class EvaluateConfig(StageConfig):
     gallery: int = Field(24, ge=0)  # views shown in the report
     lpips: Literal["none", "vgg", "alex"] = "none"
     lpips_folder: str | None = runtime(None)  # where its weights lie; which they are is known from the network's name
+    timing_scenes: int = runtime(5, ge=0)  # scenes on which the stages are timed; 0: none
     device: Literal["auto", "cpu", "cuda"] = runtime("auto")
 
 
@@ -53,7 +57,7 @@ class Worker:
 class Evaluate(MapStage):
     name = "evaluate"
     headline = "report.html"
-    version = 1
+    version = 2
     inputs = ("shard", "train")
     Config = EvaluateConfig
 
@@ -106,6 +110,7 @@ class Evaluate(MapStage):
         from stages.arrays import pack_json
         from stages.dataset import decode_sample
         from stages.evaluation.baselines import best_constants, measure_baseline
+        from stages.evaluation.ceiling import view_noise
         from stages.exr import encode_rgb
         from stages.metrics import measure_all
         from stages.predict import predict_scene
@@ -126,7 +131,11 @@ class Evaluate(MapStage):
                 "constant": constant[number],
                 "direct": measure_all(target, sample.views[camera].direct, worker.metrics),
             }
-            rows.append({"index": camera, "scores": scores})
+            shown = {
+                "roughness": visible_roughness(scene, sample.views[camera].triangle),
+                "noise": view_noise(scene.meta, camera),
+            }
+            rows.append({"index": camera, **shown, "scores": scores})
             members[f"view{camera}.prediction.exr"] = encode_rgb(prediction)
         facts = {
             "id": item.id,
@@ -139,16 +148,17 @@ class Evaluate(MapStage):
 
     def finish(self, config: EvaluateConfig, inputs: Inputs, draft: Draft) -> None:
         from stages.arrays import unpack_json
-        from stages.dataset import decode_sample
-        from stages.evaluation.report import write_report
+        from stages.evaluation.ceiling import ceiling, noise_pairs
+        from stages.evaluation.report import write_evaluation
+        from stages.evaluation.runs import run_of
         from stages.evaluation.statistics import summarise
-        from stages.exr import decode_rgb
         from stages.metrics import with_lpips
 
         shard, train = inputs["shard"], inputs["train"]
-        scenes = [unpack_json(draft.read(row.id).members["metrics.json"]) for row in draft.rows()]
+        scenes = [unpack_json(draft.read(row.id, ("metrics.json",)).members["metrics.json"]) for row in draft.rows()]
         metrics = with_lpips(config.lpips, None)
         summary = summarise(scenes, metrics)
+        summary["ceiling"] = ceiling(scenes, config.split, *noise_pairs(shard, config.split))
         log = [json.loads(line) for line in train.file("log.jsonl").read_text().splitlines() if line]
         summary["train"] = {
             "key": train.key,
@@ -160,24 +170,38 @@ class Evaluate(MapStage):
             "split": config.split,
             "scenes": {g: len(shard.ids(g)) for g in shard.groups()},
         }
-
-        def images(scene_id: str, camera: int) -> dict[str, np.ndarray]:
-            view = decode_sample(shard.read(scene_id)).views[camera]
-            prediction = decode_rgb(draft.read(scene_id).members[f"view{camera}.prediction.exr"])
-            return {"target": view.image, "prediction": prediction, "direct": view.direct}
-
-        configs = {name: inputs[name].manifest["preimage"]["params"] for name in ("train", "shard")}
-        configs["evaluate"] = config.model_dump(mode="json")
-        facts = report_facts(summary, scenes[0]["resolution"], draft.key)
-        write_report(draft.files, summary, config.split, facts, configs, log, images, config.gallery, metrics)
+        timing = self._time(config, inputs, scenes, draft)
+        params = config.model_dump(mode="json")
+        write_evaluation(draft.files, run_of("model", draft, params, summary, timing, shard, train), config.gallery)
         means = {
             method: {name: round(v["mean"], metrics[name].digits) for name, v in row.items()}
-            for method, row in summary["methods"].items()
+            for method, row in [*summary["methods"].items(), ("ceiling", summary["ceiling"])]
         }
         draft.note("metrics", {"beats_baselines": summary["beats_baselines"], **means})
         for name in ("psnr", "log_error"):
-            values = ", ".join(f"{method} {metrics[name].format(row[name])}" for method, row in means.items())
+            values = ", ".join(f"{method} {metrics[name].format(row[name])}" for method, row in means.items() if name in row)
             draft.log(f"{metrics[name].heading}: {values}")
+
+    def _time(
+        self, config: EvaluateConfig, inputs: Inputs, scenes: list[dict[str, Any]], draft: Draft
+    ) -> dict[str, Any] | None:
+        """What timing.json gets: the stages' times on some of the scenes, from the smallest to the largest."""
+        import numpy as np
+
+        from pipeline.files import write_json
+        from stages.dataset import decode_sample
+        from stages.evaluation.timing import time_model
+        from stages.predict import load_model
+
+        by_size = sorted(scenes, key=lambda scene: (scene["triangles"], scene["id"]))
+        places = np.unique(np.linspace(0, len(by_size) - 1, min(config.timing_scenes, len(by_size))).round().astype(int))
+        if not len(places):
+            return None
+        samples = [decode_sample(inputs["shard"].read(by_size[place]["id"])) for place in places]
+        model = load_model(inputs["train"].file("checkpoint"))
+        timing = time_model(model, samples, choose_device(config.device, "evaluate.device"))
+        write_json(draft.files / "timing.json", timing)
+        return timing
 
     def check(self, draft: Draft) -> None:
         assert (draft.files / "report.html").is_file(), "evaluate wrote no report"
@@ -198,6 +222,16 @@ def training_images(shard: Artifact, views: int) -> Iterator[np.ndarray]:
         yield np.stack([view.image for view in decode_sample(shard.read(scene_id)).views.values()])
 
 
+def visible_roughness(scene: SceneRecord, triangle: np.ndarray) -> float | None:
+    """Mean roughness over the pixels of a view, weighted by the specular reflectance that they show.
+
+    triangle: (H, W), the triangle in each pixel, -1 for nothing. None where nothing that is seen is specular.
+    """
+    seen = triangle[triangle >= 0]
+    weight = scene.specular.mean(axis=1)[seen].astype("float64")
+    return round(float(weight @ scene.roughness[seen] / weight.sum()), 4) if weight.any() else None
+
+
 def network(checkpoint: Path) -> dict[str, int]:
     """Size of the network in a released-format checkpoint folder, from its headers alone."""
     from safetensors import safe_open
@@ -207,20 +241,3 @@ def network(checkpoint: Path) -> dict[str, int]:
         parameters = sum(math.prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118 - not a dict
     names = {"width": "latent_dim", "layers": "num_layers", "view_layers": "view_transformer_n_layers"}
     return {"parameters": parameters, **{ours: config[theirs] for ours, theirs in names.items()}}
-
-
-def report_facts(summary: dict[str, Any], resolution: int, key: str) -> dict[str, str]:
-    """What the report says about itself: label -> text."""
-    train, data = summary["train"], summary["data"]
-    counts = ", ".join(
-        f"{data['scenes'][split]:,} {split}" for split in ("train", "validation", "test") if split in data["scenes"]
-    )
-    return {
-        "model": f"{train['layers']} + {train['view_layers']} layers, width {train['width']}, "
-        f"{train['parameters']:,} parameters, {train['steps']:,} training steps",
-        "data": f"{counts} scenes at {resolution}×{resolution} pixels; evaluated here: {data['split']}",
-        **({} if "train" in data["scenes"] else {"mean training image": "of the evaluated scenes: there are no others"}),
-        "train artifact": train["key"][:12],
-        "shard artifact": data["key"][:12],
-        "this artifact": key[:12],
-    }

@@ -48,7 +48,9 @@ def test_from_nothing_to_a_report(first, folder):
         r"""(src|href)\s*=\s*["']?(https?:)?//""", page.replace('xlink:href="#', "")
     )  # opens from disk, offline
     metrics = json.loads((report.parent / "metrics.json").read_text())
-    assert metrics
+    assert metrics["methods"]["model"]["psnr"]["mean"] > 0
+    assert set(metrics["ceiling"]) >= {"log_error"}  # the renderer's estimate, in every view
+    assert json.loads((report.parent / "timing.json").read_text())["median"]["encode"] > 0
 
 
 def test_second_run_computes_nothing(first, folder):

@@ -1,1 +1,1 @@
-"""What *evaluate* is made of: baselines, statistics over scenes, the HTML report."""
+"""What *evaluate* is made of: baselines, the noise ceiling, statistics over scenes, times, the HTML report."""

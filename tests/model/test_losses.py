@@ -8,24 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from model.losses import LPIPS, NETWORKS, image_loss, log_radiance, tone_map
-
-
-def write_weights(folder, network: str) -> None:
-    """Random weights in the layout of the published files."""
-    torch.manual_seed(1)
-    spec = NETWORKS[network]
-    metric = LPIPS(network)
-    features = {"classifier.0.weight": torch.zeros(1)}
-    number = 0
-    for layer, stage in zip(spec["layers"], metric.stages, strict=True):
-        if len(layer) == 4:
-            features[f"features.{number}.weight"] = torch.randn_like(stage.weight) / math.sqrt(stage.weight[0].numel())
-            features[f"features.{number}.bias"] = torch.randn_like(stage.bias) * 0.1
-        number += 2 if len(layer) == 4 else 1  # a ReLU follows each convolution
-    torch.save(features, folder / spec["features"][0])
-    linear = {f"lin{i}.model.1.weight": torch.rand_like(parameter) for i, parameter in enumerate(metric.linear)}
-    torch.save(linear, folder / spec["linear"][0])
+from model.losses import LPIPS, image_loss, log_radiance, tone_map
+from tests.model.lpips import distance, write_weights
 
 
 def test_loss_is_l1_in_log_space():
@@ -52,59 +36,15 @@ def test_lpips_from_files(tmp_path, network):
     assert (near > 0).all() and (far > near).all()
 
 
-# torchvision's networks: convolutions by number, as (stride, padding), after which the features are compared; "pool" between
-WRITTEN_OUT = {
-    "vgg": (
-        [0, 2, "pool", 5, 7, "pool", 10, 12, 14, "pool", 17, 19, 21, "pool", 24, 26, 28], {}, {2, 7, 14, 21, 28}, 2,
-    ),
-    "alex": ([0, "pool", 3, "pool", 6, 8, 10], {0: (4, 2), 3: (1, 2)}, {0, 3, 6, 8, 10}, 3),
-}  # fmt: skip
-
-
 @pytest.mark.parametrize("network", ["vgg", "alex"])
 def test_lpips_equals_its_definition(tmp_path, network, monkeypatch):
-    """Zhang et al. 2018, equation 1, in float64 numpy from the files: convolutions as sums over shifted images."""
     write_weights(tmp_path, network)
     monkeypatch.setenv("LIGHTMILL_LPIPS", str(tmp_path))
     metric = LPIPS.load(None, network)
-    features, linear = (
-        {key: value.double().numpy() for key, value in torch.load(tmp_path / spec[0], weights_only=True).items()}
-        for spec in (NETWORKS[network]["features"], NETWORKS[network]["linear"])
-    )
-    layers, geometry, compared, pool_size = WRITTEN_OUT[network]
-
-    def convolve(x, number):
-        weight, bias = features[f"features.{number}.weight"], features[f"features.{number}.bias"]
-        stride, padding = geometry.get(number, (1, 1))
-        x = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
-        rows, columns = ((n - weight.shape[-1]) // stride + 1 for n in x.shape[1:])
-        out = np.zeros((len(weight), rows, columns)) + bias[:, None, None]
-        for i, j in np.ndindex(weight.shape[2:]):
-            window = x[:, i : i + stride * rows : stride, j : j + stride * columns : stride]
-            out += np.tensordot(weight[:, :, i, j], window, axes=1)
-        return np.maximum(out, 0)
-
-    def pool(x):
-        rows, columns = ((n - pool_size) // 2 + 1 for n in x.shape[1:])
-        return np.max(
-            [x[:, i : i + 2 * rows : 2, j : j + 2 * columns : 2] for i, j in np.ndindex(pool_size, pool_size)], axis=0
-        )
-
-    def levels(image):
-        x = (2 * image - 1 - np.array([-0.030, -0.088, -0.188])[:, None, None]) / np.array([0.458, 0.448, 0.450])[:, None, None]
-        for layer in layers:
-            x = pool(x) if layer == "pool" else convolve(x, layer)
-            if layer in compared:
-                yield x / (np.sqrt((x**2).sum(axis=0)) + 1e-10)
-
     rng = np.random.default_rng(3)
     a, b = (rng.uniform(size=(3, 36, 40)) for _ in range(2))
-    expected = sum(
-        ((x - y) ** 2 * linear[f"lin{i}.model.1.weight"][0]).sum(axis=0).mean()
-        for i, (x, y) in enumerate(zip(levels(a), levels(b), strict=True))
-    )
     found = metric(*(torch.from_numpy(image).float()[None] for image in (a, b))).item()
-    assert found == pytest.approx(expected, rel=1e-4)
+    assert found == pytest.approx(distance(tmp_path, network, a, b), rel=1e-4)
 
 
 def test_the_gradient_goes_through_the_tone_map(tmp_path):

@@ -18,12 +18,25 @@ from pipeline.stage import Record
 from stages.arrays import pack_json, unpack_json
 from stages.dataset.encoding import encode_scene
 from stages.evaluation.baselines import best_constants, mean_images, measure_baseline
-from stages.evaluation.report import loss_curve, markdown
-from stages.evaluation.statistics import JUDGED, METHODS, bootstrap, summarise, worst_first
+from stages.evaluation.ceiling import ceiling, noise_pairs
+from stages.evaluation.plots import loss_curves
+from stages.evaluation.runs import facts
+from stages.evaluation.statistics import (
+    BARS,
+    JUDGED,
+    METHODS,
+    ROUGHNESS_BINS,
+    TRIANGLE_BINS,
+    bootstrap,
+    difference,
+    summarise,
+    worst_first,
+)
+from stages.evaluation.tables import markdown
 from stages.exr import decode_rgb, encode_view
 from stages.metrics import METRICS, log_error, measure_all
 from stages.records import SceneRecord, ViewRecord
-from stages.s07_evaluate import Evaluate, EvaluateConfig, report_facts, training_images
+from stages.s07_evaluate import Evaluate, EvaluateConfig, training_images, visible_roughness
 from stages.tonemap import clamp
 from tests.stages.fakes import FakeArtifact
 
@@ -92,8 +105,9 @@ def scores_like(value: float) -> dict[str, float]:
 
 
 def scene(name: str, psnrs: list[float], bar: float, **facts) -> dict:
+    shown = {"roughness": 0.3, "noise": {"log_error": None, "pair": None}}
     views = [
-        {"index": i, "scores": {m: scores_like(value if m == "model" else bar) for m in METHODS}}
+        {"index": i, **shown, "scores": {m: scores_like(value if m == "model" else bar) for m in METHODS}}
         for i, value in enumerate(psnrs)
     ]
     return {"id": name, "template": "box", "lights": 1, "triangles": 9, "resolution": 16, "views": views, **facts}
@@ -115,7 +129,7 @@ class TestStatistics:
         summary = summarise([scene("a", [10, 12], 11.5), scene("b", [11], 11.5)])
         assert summary["views"] == 3 and not summary["beats_baselines"]
         assert summary["gains"]["constant"]["psnr"]["mean"] == pytest.approx(-0.5)
-        text = markdown(summary)
+        text = markdown({**summary, "ceiling": {}})
         assert text.count("does not beat") == 4 and "gain -0.50 dB" in text
         assert "gain -0.5000 (95 %" in text  # log error counts the other way round: a gain is less error
 
@@ -133,10 +147,82 @@ class TestStatistics:
             ("floor", 2, 20),
         ]
         assert [row["value"] for row in by["lights"]] == [1, 3]
-        ranks = [(rank, some["id"], view["index"]) for rank, some, view in worst_first(scenes, 10)]
+        ranks = [(rank, some["id"], view["index"]) for rank, (some,), (view,) in worst_first([scenes], 10)]
         assert ranks == [(1, "a", 0), (2, "b", 0), (3, "a", 1)]
-        assert [rank for rank, _, _ in worst_first(scenes, 2)] == [1, 3]
-        assert worst_first(scenes, 0) == []
+        assert [rank for rank, _, _ in worst_first([scenes], 2)] == [1, 3]
+        assert worst_first([scenes], 0) == []
+
+    def test_breakdowns_put_views_into_the_bins_that_they_state(self):
+        scenes = [scene(f"{n}", [float(n), 7.0], 0, triangles=n) for n in (256, 257, 9000)]
+        for some, roughness in zip(scenes, (0.05, 0.1, None), strict=True):
+            some["views"][1]["roughness"] = roughness
+        by = summarise(scenes)["by"]
+        assert [row["value"] for row in by["triangles"]] == [TRIANGLE_BINS[0], TRIANGLE_BINS[1], TRIANGLE_BINS[-1]]
+        assert TRIANGLE_BINS[:2] == ("1–256", "257–384") and TRIANGLE_BINS[-1] == "> 8192"
+        # the views of one scene may lie in different bins
+        rough = {row["value"]: row for row in by["roughness"]}
+        assert list(rough) == [ROUGHNESS_BINS[0], ROUGHNESS_BINS[1], "0.2–0.4", "nothing glossy"]
+        assert (rough["0.2–0.4"]["scenes"], rough["0.2–0.4"]["views"]) == (3, 3)
+        assert rough["0.2–0.4"]["model"]["psnr"] == pytest.approx((256 + 257 + 9000) / 3)
+        assert rough["0.2–0.4"]["interval"]["psnr"] == [256, 9000]
+        assert rough["< 0.1"]["interval"]["psnr"] is None  # one scene has no spread
+
+    def test_a_difference_between_runs_is_paired_and_positive_where_the_first_is_better(self):
+        base = [scene(name, [psnr, psnr + 20], 0) for name, psnr in (("a", 10.0), ("b", 30.0), ("c", 50.0))]
+        ours = [scene(some["id"], [view["scores"]["model"]["psnr"] + 1 for view in some["views"]], 0) for some in base]
+        found = difference(ours[::-1], base, {"a", "b"})
+        assert (found["scenes"], found["views"]) == (2, 4)
+        for name in ("psnr", "flip"):  # a gain in every metric, and the same in every view: no spread is left
+            assert found["gains"][name] == pytest.approx({"mean": 1, "low": 1, "high": 1})
+        assert difference(ours, base, set()) is None
+
+    def test_several_runs_rank_the_views_that_they_share_by_their_mean(self):
+        runs = [[scene("a", [10, 30], 0), scene("b", [20], 0)], [scene("a", [40, 5], 0), scene("c", [1], 0)]]
+        ranked = worst_first(runs, 10)
+        assert [(rank, one["id"], view["index"]) for rank, (one, _), (view, _) in ranked] == [(1, "a", 1), (2, "a", 0)]
+        assert [view["scores"]["model"]["psnr"] for _, _, views in ranked for view in views] == [30, 5, 10, 40]
+
+
+class TestCeiling:
+    def test_it_is_what_the_noiseless_truth_scores(self):
+        """Three independent noisy renders of a known truth: the pair tells how the truth would score against the third."""
+        from stages.rendering.noise import error_of_one
+
+        rng = np.random.default_rng(5)
+        scenes, pairs, real = [], [], []
+        for number in range(8):
+            truth = np.broadcast_to(rng.uniform(0.3, 0.6, 3), (64, 64, 3))
+            a, b, target = (truth + rng.normal(0, 0.02, truth.shape) for _ in range(3))
+            scored = measure_all(target.astype(np.float32), truth.astype(np.float32))
+            pairs.append([error_of_one(a, b)])
+            some = scene(f"{number}", [20.0], 0)
+            some["views"][0]["noise"]["log_error"] = scored["log_error"]
+            scenes.append(some)
+            real.append(scored)
+        found = ceiling(scenes, "test", pairs, "all splits")
+        assert found["psnr"]["mean"] == pytest.approx(np.mean([row["psnr"] for row in real]), abs=0.05)
+        assert found["log_error"]["mean"] == pytest.approx(np.mean([row["log_error"] for row in real]))
+        assert (found["psnr"]["of"], found["log_error"]["of"]) == ("all splits", "test")
+        for some in scenes:  # without estimates the pairs tell the log error as well
+            some["views"][0]["noise"]["log_error"] = None
+        found = ceiling(scenes, "test", pairs, "test")
+        assert found["log_error"]["mean"] == pytest.approx(np.mean([row["log_error"] for row in real]), rel=0.02)
+        assert ceiling(scenes, "test", [], "test") == {}
+
+    def test_pairs_are_looked_for_in_all_splits_where_the_evaluated_one_has_few(self, inputs):
+        pairs, where = noise_pairs(inputs["shard"], "test")
+        assert where == "all splits"
+        assert pairs == [[{"psnr": 30.0, "log_error": 0.01}]] * 9  # of camera 2 of every scene
+
+
+def test_roughness_of_a_view_is_that_of_what_it_shows(inputs):
+    from stages.dataset import decode_sample
+
+    shown = decode_sample(inputs["shard"].read("test-0")).scene
+    shown.roughness[:3], shown.specular[:3] = [0.1, 0.5, 0.9], [[0.2] * 3, [0.6] * 3, [0.0] * 3]
+    assert visible_roughness(shown, np.array([[0, 1], [2, -1]])) == pytest.approx((0.2 * 0.1 + 0.6 * 0.5) / 0.8)
+    assert visible_roughness(shown, np.array([[0, 0], [0, 1]])) == pytest.approx((0.6 * 0.1 + 0.6 * 0.5) / 1.2)
+    assert visible_roughness(shown, np.array([[2, -1]])) is None
 
 
 class Artifact(FakeArtifact):
@@ -146,17 +232,24 @@ class Artifact(FakeArtifact):
 
     def __init__(self, path, records):
         super().__init__(path, records)
-        self.manifest = {"preimage": {"params": {"model": {"latent_dim": 8}, "note": "<b>"}}}
+        self.manifest["preimage"]["params"] = {"model": {"latent_dim": 8}, "note": "<b>"}
+
+    def row(self, id):
+        return SimpleNamespace(digest=f"of {id}")
 
     def groups(self):
         return sorted({row.group for row in self.rows()})
+
+
+PAIR = {"psnr": 30.0, "log_error": 0.01}
 
 
 def shard_record(name: str, rng: np.random.Generator, cameras: list[int], lights: int) -> Record:
     n = 6
     triangles = rng.uniform(-0.5, 0.5, (n, 3, 3))
     light_index = np.where(np.arange(n) < lights, np.arange(n), -1)
-    meta = {"template": "corner", "views": cameras}
+    noted = [{"index": i, "error": 0.02, **({"noise": {"sum": PAIR}} if i == 2 else {})} for i in range(4)]
+    meta = {"template": "corner", "views": cameras, "render": {"views": noted}}
     made = SceneRecord(
         name, triangles, np.ones((n, 3, 3)), np.ones((n, 3)), np.ones((n, 3)), np.ones(n), np.ones((n, 3)),
         light_index, np.zeros(n), np.tile(np.eye(4), (4, 1, 1)), np.full(4, 45.0), meta,
@@ -167,6 +260,7 @@ def shard_record(name: str, rng: np.random.Generator, cameras: list[int], lights
         layers = (base + hdr(rng, lights, SIZE, SIZE, 3) * 0.1).astype(np.float32) / lights
         flat = np.zeros((SIZE, SIZE, 3), np.float32)
         nothing = np.full(layers.shape[1:3], -1, np.int32)
+        nothing[0, 0] = 1
         view = ViewRecord(
             layers, layers.sum(axis=0) * 0.6, flat, flat, flat[..., 0], flat[..., 0], nothing, nothing, {"index": camera}
         )
@@ -214,7 +308,7 @@ def predictor(monkeypatch, inputs):
 
 
 def evaluate(config: EvaluateConfig, inputs, path) -> tuple[list[Record], Artifact]:
-    stage = Evaluate()
+    config, stage = config.model_copy(update={"timing_scenes": 0}), Evaluate()  # no network is there to be timed
     worker = stage.open(config, inputs, {"device": "cpu"})
     items = list(stage.items(config, inputs))
     records = [record for item in items for record in stage.process(worker, item)]
@@ -229,6 +323,8 @@ def test_records_hold_every_score_and_the_predictions(inputs, predictor, tmp_pat
     assert [record.id for record in records] == ["test-0", "test-1", "test-2"]
     made = unpack_json(records[1].members["metrics.json"])
     assert (made["template"], made["lights"], made["triangles"], made["resolution"]) == ("corner", 2, 6, SIZE)
+    assert [view["noise"] for view in made["views"]] == [{"log_error": 0.02, "pair": pair} for pair in (None, PAIR)]
+    assert {view["roughness"] for view in made["views"]} == {1.0}
     assert [view["index"] for view in made["views"]] == [0, 2]  # camera indices, not positions
     for view in made["views"]:
         assert set(view["scores"]) == set(METHODS)
@@ -259,6 +355,8 @@ def test_the_report_is_one_page_with_the_truth_in_it(inputs, predictor, tmp_path
     numbers = json.loads((draft.files / "metrics.json").read_text())
     assert numbers["beats_baselines"] and numbers["scenes"] == 3 and numbers["views"] == 6
     assert numbers["data"]["scenes"] == {"test": 3, "train": 6}
+    assert numbers["ceiling"]["psnr"]["mean"] == 30 and numbers["ceiling"]["log_error"]["mean"] == pytest.approx(0.02)
+    assert page.count("the noiseless truth would score") == 2
     assert (
         f"**{METRICS['psnr'].format(numbers['methods']['model']['psnr']['mean'])}**" in (draft.files / "metrics.md").read_text()
     )
@@ -276,7 +374,7 @@ def test_a_win_within_the_interval_is_called_close(inputs, predictor, tmp_path):
     predictor.by_scene = {"test-0": 0.0, "test-1": 0.0}
     _, draft = evaluate(EvaluateConfig(), inputs, tmp_path / "out")
     gains = json.loads((draft.files / "metrics.json").read_text())["gains"]
-    close = sum(row[name]["low"] <= 0 <= row[name]["high"] for row in gains.values() for name in JUDGED)
+    close = sum(gains[bar][name]["low"] <= 0 <= gains[bar][name]["high"] for bar in BARS for name in JUDGED)
     assert close and (draft.files / "report.html").read_text().count("too close to call") == close
 
 
@@ -297,10 +395,11 @@ def test_without_training_scenes_the_mean_image_is_that_of_the_others_and_the_re
     summary = {
         "train": dict(layers=1, view_layers=1, width=8, parameters=1, steps=0, key="a"),
         "data": {"key": "b", "split": "test"},
+        "per_scene": [{"resolution": 16}],
     }
     for scenes, told in (({"test": 3}, True), ({"train": 6, "test": 3}, False)):
         summary["data"]["scenes"] = scenes
-        assert ("mean training image" in report_facts(summary, 16, "c")) == told
+        assert ("mean training image" in facts(summary, "c")) == told
 
 
 def test_a_split_without_scenes_is_named(inputs):
@@ -319,4 +418,30 @@ def test_the_shipped_config_is_the_default_one():
 
 
 def test_a_log_without_validation_still_draws():
-    assert loss_curve([{"step": 1, "loss": 0.5}, {"step": 2, "loss": 0.4}]).startswith("<svg")
+    assert loss_curves({"model": [{"step": 1, "loss": 0.5}, {"step": 2, "loss": 0.4}]}).startswith("<svg")
+    assert loss_curves({"given": []}) == ""
+
+
+@pytest.mark.parametrize("variant", [{}, {"use_dpt_decoder": False}, {"pe_type": "nerf", "use_dpt_decoder": False}])
+def test_every_step_of_a_model_is_timed_and_nothing_stays_hooked(inputs, variant):
+    from model.config import ModelConfig
+    from model.renderformer import RenderFormer
+    from stages.dataset import decode_sample
+    from stages.evaluation.timing import REPEATS, STEPS, time_model
+
+    small = dict(
+        latent_dim=128, num_layers=1, num_heads=1, dim_feedforward=128, num_register_tokens=2, texture_encode_patch_size=1,
+        view_transformer_latent_dim=128, view_transformer_n_layers=4, view_transformer_n_heads=1,
+        view_transformer_ffn_hidden_dim=128, dpt_features=8, dpt_out_channels=(8, 8, 8, 8),
+    )  # fmt: skip
+    model = RenderFormer(ModelConfig(**small | variant))
+    runs = []
+    model.view_transformer.register_forward_hook(lambda *_: runs.append(1))
+    samples = [decode_sample(inputs["shard"].read(id)) for id in ("test-0", "test-2")]
+    timing = time_model(model, samples, "cpu")
+    assert len(runs) == 2 * (REPEATS + 1)
+    assert [row["id"] for row in timing["scenes"]] == ["test-0", "test-2"] and timing["resolution"] == SIZE
+    assert set(timing["median"]) == set(STEPS)
+    assert all(row[step] > 0 for row in timing["scenes"] for step in STEPS if step != "project" or "pe_type" not in variant)
+    head = model.view_transformer.out_proj if "use_dpt_decoder" in variant else model.view_transformer.out_dpt
+    assert not head._forward_pre_hooks

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.errors import UserError
 from stages.metrics import (
     METRICS,
     PSNR_MAX,
@@ -13,6 +14,7 @@ from stages.metrics import (
     flip_map,
     log_error,
     measure_all,
+    named,
     psnr,
     ssim,
     with_lpips,
@@ -29,6 +31,54 @@ from stages.tonemap import (
     tone_map,
     tone_unmap,
 )
+
+
+def hdr_pair(seed: int, shape: tuple[int, int], scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """A random HDR image of about this brightness, and a distorted copy with some values below 0."""
+    rng = np.random.default_rng(seed)
+    reference = (rng.gamma(0.5, 2 * scale, (*shape, 3)) * np.exp(rng.normal(0, 1, (*shape, 1)))).astype(np.float32)
+    test = reference * rng.uniform(0.5, 1.5, reference.shape) + rng.normal(0, 0.03 * scale, reference.shape)
+    return reference, test.astype(np.float32)
+
+
+# dark, everyday, far above white; square, wide, tall, as small as SSIM allows
+PAIRS = [(1, (32, 32), 0.02), (2, (48, 20), 0.5), (3, (20, 48), 3.0), (4, (11, 11), 40.0), (5, (64, 64), 800.0)]
+
+
+@pytest.mark.parametrize(("seed", "shape", "scale"), PAIRS)
+def test_metrics_agree_with_the_reference_packages_on_random_hdr_images(seed, shape, scale):
+    import flip_evaluator
+    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+    reference, test = hdr_pair(seed, shape, scale)
+    scores = measure_all(reference, test)
+    linear = [np.clip(image.astype(np.float64), 0, 1) for image in (reference, test)]
+    mapped = [np.clip(np.log2(1 + np.maximum(image.astype(np.float64), 0)), 0, 1) for image in (reference, test)]
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1, "channel_axis": 2}
+    for suffix, (a, b) in (("", linear), ("_tm", mapped)):
+        assert scores[f"psnr{suffix}"] == pytest.approx(peak_signal_noise_ratio(a, b, data_range=1), abs=1e-4)
+        assert scores[f"ssim{suffix}"] == pytest.approx(structural_similarity(a, b, **options), abs=1e-4)
+        assert scores[f"ssim{suffix}"] == pytest.approx(slow_ssim(a, b), abs=1e-4)
+    _, mean, _ = flip_evaluator.evaluate(reference, np.maximum(test, 0), "HDR", applyMagma=False, parameters={})
+    assert scores["flip"] == pytest.approx(mean, abs=1e-4)
+
+
+@pytest.mark.parametrize("network", ["vgg", "alex"])
+def test_lpips_agrees_with_its_definition_on_tone_mapped_values(network, tmp_path):
+    from tests.model.lpips import distance, write_weights
+
+    write_weights(tmp_path, network)
+    reference, test = hdr_pair(7, (36, 40), 0.5)
+    metric = with_lpips(network, str(tmp_path))[f"lpips_{network}"]
+    mapped = [np.clip(np.log2(1 + np.maximum(x.astype(np.float64), 0)), 0, 1).transpose(2, 0, 1) for x in (reference, test)]
+    expected = distance(tmp_path, network, *mapped)
+    assert expected > 0.01
+    assert metric.measure(reference, test) == pytest.approx(expected, abs=1e-4)
+
+
+def test_metrics_are_known_by_name_without_their_weights():
+    assert list(named(["lpips_vgg", "flip", "psnr"])) == ["psnr", "flip", "lpips_vgg"]
+    assert named(["lpips_vgg"])["lpips_vgg"].format(0.12345) == "0.1235"
 
 
 @pytest.fixture
@@ -138,7 +188,7 @@ def test_lpips_carries_its_net_and_asks_for_weights(pair, tmp_path):
     assert with_lpips("none", None) == METRICS
     metrics = with_lpips("alex", str(tmp_path))
     assert list(metrics) == [*METRICS, "lpips_alex"] and metrics["lpips_alex"].heading == "LPIPS (AlexNet)\u00a0↓"
-    with pytest.raises(ValueError, match="alexnet"):
+    with pytest.raises(UserError, match="alexnet.*evaluate.lpips=none"):
         measure_all(*pair, metrics)
 
 
