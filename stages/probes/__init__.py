@@ -9,6 +9,6 @@
 ``edits``      exact edits of scenes
 ``figures``    strips and curves
 
-To add one: a ``Probe`` (or a ``Sweep``: a config with ``values`` and an ``edit``) listed in ``PROBES`` of its module, a short file
-in conf/probe/, a section in docs/probes.md.
+To add one: a ``Probe`` (or a ``Sweep``: a config with ``values``, and an ``edit``) listed in ``PROBES`` of its module, a short
+file in conf/probe/, a section in docs/probes.md.
 """

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pipeline.store import Draft
 
 SHOWN = 2  # scenes in the figure
+MOST_LAYERS = 6  # columns of the figure; of more layers, evenly spaced ones
 
 
 class AttentionConfig(ProbeConfig):
@@ -113,12 +114,14 @@ class Attention(Probe):
         for number, bundle in enumerate(bundles):
             own = np.unique(tiles[bundle])
             own = own[own >= 0]
+            objects = scene.object_index[tiles[bundle][tiles[bundle] >= 0]]
+            on_object = scene.meta["objects"][np.bincount(objects).argmax()]["name"] if len(objects) else "nothing"
             for layer, row in enumerate(weights[:, number]):
                 on = row[registers:]
                 told.append(
                     {
                         "bundle": number,
-                        "on": scene.meta["objects"][scene.object_index[own[0]]]["name"] if len(own) else "nothing",
+                        "on": on_object,  # what most of its pixels see
                         "layer": layer,
                         "registers": float(row[:registers].sum()),
                         "own": float(on[own].sum()),
@@ -147,11 +150,11 @@ class Attention(Probe):
             rows.append([str(layer + 1), *shares, f"{means['effective']:.0f}"])
         triangles = np.mean([fact["triangles"] for fact in facts])
         notes = [
-            f"{len(facts)} scene(s), {sum(len(fact['bundles']) for fact in facts)} ray bundles; weights averaged over heads. A "
-            f"scene has {triangles:,.0f} triangles and {registers} registers on average: evenly spread, the registers would get "
-            f"{100 * registers / (registers + triangles):.1f} %.",
+            f"{len(facts)} scene(s), {sum(len(fact['bundles']) for fact in facts)} ray bundles; weights averaged over heads. "
+            f"A scene has {triangles:,.0f} triangles on average and {registers} registers: spread evenly, the registers would "
+            f"get {100 * registers / (registers + triangles):.1f} %.",
             "The bundle's own triangles are those that its 8 x 8 pixels see. Effective number of tokens: exp of the entropy.",
-            "In the figure the square marks the bundle; each layer's picture is scaled to its own largest weight, given above it.",
+            "In the figure the square marks the bundle; a layer's picture is scaled to the largest weight in it, given above.",
         ]
         return Outcome(columns, rows, figure, notes)
 
@@ -164,11 +167,12 @@ class Attention(Probe):
         from stages.tonemap import exposure_for, to_picture
 
         config, patch = worker.config, worker.model.config.patch_size
-        layers = worker.model.config.view_transformer_n_layers
+        depth = worker.model.config.view_transformer_n_layers
+        layers = sorted({round(layer) for layer in np.linspace(0, depth - 1, min(depth, MOST_LAYERS))})
         bundles = sum(len(fact["bundles"]) for fact in facts[: len(records)])
-        columns = layers + 2
+        columns = len(layers) + 2
         side = (WIDTH - 0.4) / columns
-        figure = new_figure(bundles * (side + 0.32) + 0.2)
+        figure = new_figure(bundles * (side + 0.45) + 0.2)
         grid = figure.add_gridspec(bundles, columns)
         colours, line = matplotlib.colormaps["magma"], 0
         for record, fact in zip(records, facts, strict=False):
@@ -185,14 +189,15 @@ class Attention(Probe):
                     box = (column * patch - 0.5, row * patch - 0.5)
                     axes.add_patch(Rectangle(box, patch, patch, fill=False, edgecolor="#00d0ff", linewidth=1.6))
                 scale = config.drawn_px / config.resolution
-                for layer in range(layers):
+                for place, layer in enumerate(layers):
                     weights = arrays["weights"][layer, number]
                     top = float(weights[np.unique(seen[seen >= 0])].max(initial=1e-12))
+                    lights = 100 * next(entry["lights"] for entry in told if entry["layer"] == layer)
                     shown = np.where(seen >= 0, weights[seen] / top, 0)
                     pixels = colours(np.clip(shown, 0, 1) ** 0.5, bytes=True)[..., :3].copy()
                     pixels[seen < 0] = 255
-                    axes = figure.add_subplot(grid[line, 2 + layer])
-                    show_picture(axes, pixels, f"layer {layer + 1}, top {100 * top:.2g} %")
+                    axes = figure.add_subplot(grid[line, 2 + place])
+                    show_picture(axes, pixels, f"layer {layer + 1}, top {100 * top:.2g} %\non lights {lights:.0f} %")
                     box = (column * patch * scale - 0.5, row * patch * scale - 0.5)
                     axes.add_patch(Rectangle(box, patch * scale, patch * scale, fill=False, edgecolor="#00d0ff", linewidth=1.6))
                 line += 1

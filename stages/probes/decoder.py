@@ -26,8 +26,11 @@ class Decoder(nn.Module):
         self.token_norm, self.register_norm = nn.LayerNorm(dim), nn.LayerNorm(dim)
         self.attention = nn.MultiheadAttention(dim, HEADS if dim % HEADS == 0 else 1, batch_first=True)
         self.mlp = nn.Sequential(
-            nn.LayerNorm(dim), nn.Linear(dim, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 3 * texels)
+            nn.LayerNorm(dim), nn.Linear(dim, width), nn.SiLU(),
+            nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 3 * texels),
         )  # fmt: skip
+        # all texels start alike, or their random weights would stay visible as grain
+        nn.init.zeros_(self.mlp[-1].weight)
 
     def forward(self, tokens: Tensor, registers: Tensor) -> Tensor:
         x = self.token_norm(tokens)
@@ -38,7 +41,7 @@ class Decoder(nn.Module):
 
 
 def fit_decoder(samples: list[tuple[Tensor, Tensor, dict[str, np.ndarray]]], config: Any) -> Decoder:
-    """Fitted to the scenes' (registers (R, d), triangles (F, d), truth as *process* records it); a function of its arguments."""
+    """Fitted to the scenes' (registers (R, d), triangles (F, d), recorded truth); a function of its arguments."""
     kept = kept_texels(config.size)
     columns: list[list[Tensor]] = [[], [], [], []]
     for registers, triangles, truth in samples:

@@ -1,4 +1,4 @@
-"""The probes' figures: strips of pictures, curves with intervals. Matplotlib without pyplot, so that nothing outlives a call."""
+"""The probes' figures: strips of pictures, curves with intervals. Without pyplot, so that nothing outlives a call."""
 
 from __future__ import annotations
 

@@ -157,8 +157,9 @@ class Bounces(Made):
 
     def notes(self, config: BouncesConfig) -> list[str]:
         return [
-            f"A box with an object: first the back wall, then the right and the left one become mirrors (specular 0.95, roughness "
-            f"{config.roughness:g}). One: seen over one bounce; two, in a corner: over two; three: between facing mirrors, over many."
+            "A box with an object: first the back wall, then the right and the left one become mirrors (specular 0.95, "
+            f"roughness {config.roughness:g}). One mirror shows things over one bounce, two in a corner over two, the facing "
+            "ones of three over many."
         ]
 
 

@@ -70,8 +70,8 @@ class Lights(Sweep):
 
     def notes(self, config: LightsConfig) -> list[str]:
         return [
-            "N lights are the first N of 16 drawn by the released law, each with 1/N of its radiance. Light transport is linear: "
-            "the sum over single lights is exact for a renderer. Shaded: the released law's numbers of lights."
+            "N lights are the first N of 16 drawn by the released law, each with 1/N of its radiance. Light transport is "
+            "linear: the sum over single lights is exact for a renderer. Shaded: the released law's numbers of lights."
         ]
 
 
@@ -128,8 +128,8 @@ class LightsInside(Sweep):
 
     def notes(self, config: LightsInsideConfig) -> list[str]:
         return [
-            "Lights keep their size, and dim by the square of the distance, so that the centre gets the same light. The content "
-            "lies within 0.5 of the centre along each axis. Shaded: the released law's distances."
+            "Lights keep their size, and dim by the square of the distance, so that the centre gets the same light. The "
+            "content lies within 0.5 of the centre along each axis. Shaded: the released law's distances."
         ]
 
 
@@ -357,8 +357,8 @@ class Textures(Sweep):
 
     def notes(self, config: TexturesConfig) -> list[str]:
         return [
-            "Walls and objects carry patterns made by code as 32 x 32 patches. A network with texture_encode_patch_size=1 reads "
-            "only the mean of a patch: then both methods are the same."
+            "Walls and objects carry patterns made by code as 32 x 32 patches. A network with texture_encode_patch_size=1 "
+            "reads only the mean of a patch: then both methods are the same."
         ]
 
 

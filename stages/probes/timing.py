@@ -152,8 +152,8 @@ class Timing(Probe):
             plain(axes)
             axes.legend(fontsize=7.5, frameon=False)
         notes = [
-            f"{config.resolution} px; {machine(worker, threads)}; median of {config.repeats} after a warm-up. Triangles are cut in "
-            "two until there are so many; the picture stays the same.",
+            f"{config.resolution} px; {machine(worker, threads)}; median of {config.repeats} after a warm-up. Triangles are "
+            "cut in two until there are so many; the picture stays the same.",
             "View-independent: reading the arrays and encoding; view-dependent: decoding one view. Frames: other cameras of a "
             "static scene, encoded once, keys and values projected once.",
         ]
@@ -305,8 +305,8 @@ class EqualTime(Probe):
             for method, spp in equal.items()
         )
         notes = [
-            f"{len(facts)} {config.split} scene(s) at {config.resolution} px; {machine(worker, threads)}; times of the first scene, "
-            f"median of {config.repeats} after a warm-up.",
+            f"{len(facts)} {config.split} scene(s) at {config.resolution} px; {machine(worker, threads)}; times of the first "
+            f"scene, median of {config.repeats} after a warm-up.",
             f"The counts nearest to the network's {model_s:.3f} s: {ratios}.",
             f"References: {min(f['spp'] for f in facts)} to {max(f['spp'] for f in facts)} samples per pixel, denoised.",
         ]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from pipeline.config import count
 from pipeline.errors import UserError
 from pipeline.keys import seed_for
 from pipeline.stage import Inputs, Item, Record
@@ -33,11 +34,12 @@ SWATCHES = 8  # triangles of each that are shown as textures
 
 class TokensConfig(ProbeConfig):
     name: Literal["tokens"] = "tokens"
+    scenes: int = count(2, ge=1)
     fit_split: Literal["train", "validation", "test"] = "train"  # the decoder learns from these scenes ...
-    fit_scenes: int = Field(24, ge=1)
-    triangles: int = Field(96, ge=1)  # ... and of each from so many triangles, drawn by lot; of a held-out one, from all seen
+    fit_scenes: int = Field(64, ge=1)
+    triangles: int = Field(32, ge=1)  # ... and of each from so many triangles, drawn by lot; of a held-out one, from all seen
     size: int = Field(32, ge=4, le=64)  # texels along a triangle's legs
-    spp: int = Field(16, ge=1)  # samples per texel
+    spp: int = Field(32, ge=1)  # samples per texel
     steps: int = Field(400, ge=1)
     batch: int = Field(256, ge=1)  # triangles per step
     width: int = Field(512, ge=8)  # of the MLP
@@ -112,8 +114,10 @@ class Tokens(Probe):
             f"Decoder fitted to {fitted:,} triangles of {len(fit)} {config.fit_split} scenes in {config.steps} steps, judged "
             f"on {judged:,} triangles of {len(held)} {config.split} scenes, {config.size} x {config.size} texels at "
             f"{config.spp} samples each; 95 % intervals over scenes.",
-            "Error: mean absolute difference of log10(1 + radiance), of the diffuse part that leaves a triangle's front. Tokens "
-            "that enter the encoder know shape, place and material of their own triangle only.",
+            "Error: mean absolute difference of log10(1 + radiance), of the diffuse part that leaves a triangle's front. "
+            "Tokens that enter the encoder know shape, place and material of their own triangle only.",
+            "Below the pictures: triangles that vary most within themselves among the larger ones in the picture, each with an "
+            "exposure of its own; grey where something covers the surface.",
         ]
         if not worker.model.config.num_layers:
             notes.append("This network has no view-independent layers: both kinds of token are the same.")
@@ -124,11 +128,12 @@ class Tokens(Probe):
         self, config: TokensConfig, worker: Worker, draft: Draft, ids: list[str], scenes: dict[str, SceneRecord],
         truth: dict[str, Any], decoded: dict[str, dict[str, np.ndarray]],
     ) -> Any:  # fmt: skip
+        from stages.probes.decoder import kept_texels
         from stages.probes.figures import WIDTH, new_figure, show_picture
         from stages.tonemap import exposure_for, to_picture
 
-        names = list(decoded)[:2]
-        titles = ["path traced picture", "truth at the texels", *(f"decoded from {name}" for name in names)]
+        names, kept = list(decoded)[:2], kept_texels(config.size)
+        titles = ["path traced picture", "truth at the texels", *(f"decoded from\n{name}" for name in names)]
         side = (WIDTH - 0.2) / len(titles)
         small = (WIDTH - 0.6) / (SWATCHES + 1)
         figure = new_figure(len(ids) * (side + 3 * small + 0.75))
@@ -155,7 +160,8 @@ class Tokens(Probe):
                 brightest = exposure_for(sheets[0][face][told["met"][face]])
                 for row, (sheet, name) in enumerate(zip(sheets, ("truth", "entering", "leaving"), strict=True)):
                     swatch = to_picture(sheet[face], brightest)
-                    swatch[~told["met"][face]] = 255
+                    swatch[kept & ~told["met"][face]] = 205
+                    swatch[~kept] = 255
                     show_picture(figure.add_subplot(below[row, column]), swatch, row="" if column else name)
         return figure
 
