@@ -78,6 +78,9 @@ class RunProbe(MapStage):
         worker = Worker(config, inputs, environment["renderer"], environment["device"])
         probe = PROBES[config.name]
         outcome = probe.finish(worker, draft)
+        if {"triangles", "resolution"} <= worker.trained_with.keys():
+            seen = worker.trained_with
+            outcome.notes.append(f"Trained with scenes of at most {seen['triangles']} triangles, at {seen['resolution']} px.")
         outcome.figure.savefig(draft.files / "figure.png", metadata={"Software": None})
         told = {
             "name": probe.name,

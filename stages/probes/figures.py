@@ -12,7 +12,8 @@ from stages.metrics import METRICS
 from stages.tonemap import exposure_for, to_picture
 
 DPI = 110
-WIDTH = 9.6  # inches
+WIDTH, LEAST_WIDTH = 9.6, 7.5  # inches
+MOST_SIDE = 1.7  # of a picture, inches
 COLOURS = ("#4c78c8", "#e08a2e", "#3f9e5a", "#b5508f")
 INK = "#606870"
 
@@ -65,39 +66,39 @@ def sweep_figure(
     pictures: Mapping[str, Sequence[Sequence[np.ndarray]]],
     curves: Mapping[str, Mapping[str, Sequence[Mapping[str, float]]]],
     trained: tuple[float, float] | None,
-    log_axis: bool,
+    axis: str,
 ) -> Figure:
     """Strips above (reference, then each method, by value), curves of metrics below.
 
     pictures: scene -> rows of (H, W, 3) radiance by value. curves: metric -> method -> mean and interval by value.
-    ``trained``: the values that training had, shaded.
+    ``trained``: the values that training had, shaded. axis: linear, log or even (values side by side).
     """
-    columns, rows = len(values), sum(len(scene) for scene in pictures.values())
-    side = min((WIDTH - 0.7) / columns, 1.7)
-    figure = new_figure(rows * (side + 0.05) + 0.35 * len(pictures) + 2.5)
-    heights = [len(scene) * side + 0.3 for scene in pictures.values()]
+    side = min((WIDTH - 0.8) / len(values), MOST_SIDE)
+    heights = [len(scene) * (side + 0.05) + 0.25 for scene in pictures.values()]
+    figure = new_figure(sum(heights) + 2.8, max(len(values) * (side + 0.05) + 0.8, LEAST_WIDTH))
+    figure.suptitle(f"columns: {setting}", fontsize=9, color=INK)
     outer = figure.add_gridspec(len(pictures) + 1, 1, height_ratios=[*heights, 2.5])
+    names = ["path traced", *(methods if len(methods) > 1 else ["predicted"])]
     for number, scene in enumerate(pictures.values()):
-        titles = [f"{setting.split(',')[0]} {labels[0]}" if columns < 6 and not i else label for i, label in enumerate(labels)]
-        names = ["path traced", *(methods if len(methods) > 1 else ["predicted"])]
-        strip(figure, outer[number], list(zip(names, scene, strict=True)), titles)
+        strip(figure, outer[number], list(zip(names, scene, strict=True)), labels)
+    order = np.argsort(values)
+    places = np.array(values, float) if axis != "even" else np.arange(len(values), dtype=float)
     below = outer[len(pictures)].subgridspec(1, len(curves))
     for number, (name, lines) in enumerate(curves.items()):
         axes = figure.add_subplot(below[number])
-        if trained is not None:
-            axes.axvspan(*trained, color="#8a939b", alpha=0.14, linewidth=0, label="in training")
-        for method, colour in zip(methods, COLOURS, strict=False):
-            curve(axes, values, lines[method], method, colour)
-        if log_axis:
+        low, high = places.min(), places.max()
+        if axis == "log":
             axes.set_xscale("log", base=2)
-        axes.set_xticks(values, labels)
-        axes.minorticks_off()
-        margin = 0.04
-        low, high = min(values), max(values)
-        if not log_axis:
-            axes.set_xlim(low - margin * (high - low or 1), high + margin * (high - low or 1))
+            axes.set_xlim(low * (high / low) ** -0.04 / 1.01, high * (high / low) ** 0.04 * 1.01)
         else:
-            axes.set_xlim(low * (high / low) ** -margin, high * (high / low) ** margin)
+            axes.set_xlim(low - 0.04 * (high - low or 1), high + 0.04 * (high - low or 1))
+        if trained is not None:
+            band = trained if axis != "even" else np.interp(trained, np.sort(values), places[order])
+            axes.axvspan(*band, color="#8a939b", alpha=0.14, linewidth=0, label="in training")
+        for method, colour in zip(methods, COLOURS, strict=False):
+            curve(axes, places[order], [lines[method][index] for index in order], method, colour)
+        axes.set_xticks(places, labels)
+        axes.minorticks_off()
         axes.set_xlabel(setting, fontsize=8.5)
         axes.set_ylabel(METRICS[name].heading, fontsize=8.5)
         plain(axes)

@@ -93,7 +93,8 @@ class Occluders(Made):
     name = "occluders"
     title = "Occluders"
     question = "How fine may the shadow of many occluders between a light and the floor be?"
-    setting = "plates of equal area in all"
+    setting = "plates, of equal area in all"
+    axis = "even"
     Config = OccludersConfig
 
     def plan(self, rng: np.random.Generator, value: float, config: Any) -> tuple[Plan, list[meshes.Mesh]]:

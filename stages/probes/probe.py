@@ -172,7 +172,7 @@ Predict = Callable[[SceneRecord], np.ndarray]
 class Sweep(Probe):
     """Scenes edited for every value of a setting, traced, predicted by one or several methods, measured."""
 
-    log_axis: ClassVar[bool] = False
+    axis: ClassVar[Literal["linear", "log", "even"]] = "linear"  # of the curves; even: values side by side
 
     def edit(self, worker: Worker, scene: SceneRecord, value: float) -> SceneRecord:
         """The scene at that value of the setting."""
@@ -233,6 +233,7 @@ class Sweep(Probe):
             "lights": scene.n_lights,
             "spp": view.meta["spp"],
             "error": view.meta["error"],
+            "methods": list(scores),  # in the order of the pictures, which JSON's sorted keys lose
             "scores": scores,
         }
         yield Record(item.id, {"metrics.json": pack_json(facts), **members})
@@ -251,7 +252,7 @@ class Sweep(Probe):
                 f"probe={self.name}: no scene is left that could be rendered at every value (dark, or the camera inside an "
                 "object): use more scenes (probe.scenes) or other probe.values"
             )
-        methods = list(found[whole[0], config.values[0]]["scores"])
+        methods = found[whole[0], config.values[0]]["methods"]
 
         def scores(method: str, value: float, metric: str) -> list[float]:
             return [found[scene, value]["scores"][method][metric] for scene in whole]
@@ -297,7 +298,7 @@ class Sweep(Probe):
              for scene in shown},
             {name: {m: [summary[m, v, name] for v in config.values] for m in methods} for name in CURVES},
             self.trained(worker.trained_with),
-            self.log_axis,
+            self.axis,
         )  # fmt: skip
         notes = [f"{len(whole)} {config.split} scene(s), one view each at {config.resolution} px; 95 % intervals over scenes."]
         if len(whole) < len(asked):

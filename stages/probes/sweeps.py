@@ -154,7 +154,7 @@ class LargeLight(Sweep):
     question = "Training lights are small: are large ones predicted better when cut into smaller triangles?"
     setting = "edge of the lights, as sampled = 1"
     Config = LargeLightConfig
-    log_axis = True
+    axis = "log"
 
     def edit(self, worker: Worker, scene: SceneRecord, value: float) -> SceneRecord:
         return edits.larger_lights(scene, value)
@@ -243,7 +243,7 @@ class Resolution(Sweep):
     question = "Does a network that was trained at one resolution render at others?"
     setting = "pixels per side"
     Config = ResolutionConfig
-    log_axis = True
+    axis = "log"
 
     def edit(self, worker: Worker, scene: SceneRecord, value: float) -> SceneRecord:
         return scene
@@ -278,7 +278,7 @@ class MoreTriangles(Sweep):
     question = "The same scene in more and smaller triangles looks the same: does the network say so?"
     setting = "triangles, as sampled = 1"
     Config = MoreTrianglesConfig
-    log_axis = True
+    axis = "log"
 
     def edit(self, worker: Worker, scene: SceneRecord, value: float) -> SceneRecord:
         return edits.bisected(scene, round(value * len(scene.triangles)))
@@ -304,7 +304,7 @@ class TriangleSize(Sweep):
     setting = "faces per object, at most"
     Config = TriangleSizeConfig
     reads = ("decimate", "shard", "train")
-    log_axis = True
+    axis = "log"
 
     def suits(self, meta: Mapping[str, Any]) -> bool:
         return any("object_id" in entry for entry in meta["objects"])
@@ -344,7 +344,7 @@ class Textures(Sweep):
     question = "Does the network read the patches of textured triangles, and how fine may the pattern be?"
     setting = "repeats of the pattern per object"
     Config = TexturesConfig
-    log_axis = True
+    axis = "log"
 
     def edit(self, worker: Worker, scene: SceneRecord, value: float) -> SceneRecord:
         return edits.patterned(scene, value, worker.rng("textures", scene.id))
