@@ -15,6 +15,7 @@ DPI = 110
 WIDTH, LEAST_WIDTH = 9.6, 7.5  # inches
 MOST_SIDE = 1.7  # of a picture, inches
 COLOURS = ("#4c78c8", "#e08a2e", "#3f9e5a", "#b5508f")
+LINES = ("-", "--", ":", "-.")  # of the methods, so that equal curves do not hide one another
 INK = "#606870"
 
 
@@ -44,11 +45,13 @@ def strip(figure: Figure, where: object, rows: Sequence[tuple[str, Sequence[np.n
             show_picture(figure.add_subplot(grid[number, column]), to_picture(image, exposure), title, "" if column else name)
 
 
-def curve(axes: object, x: Sequence[float], found: Sequence[Mapping[str, float]], label: str, colour: str) -> None:
+def curve(
+    axes: object, x: Sequence[float], found: Sequence[Mapping[str, float]], label: str, colour: str, line: str = "-"
+) -> None:
     """Means over ``x`` with their intervals."""
     mean, low, high = (np.array([row[key] for row in found]) for key in ("mean", "low", "high"))
     axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
-    axes.plot(x, mean, color=colour, marker="o", markersize=4, linewidth=1.6, label=label)
+    axes.plot(x, mean, line, color=colour, marker="o", markersize=4, linewidth=1.6, label=label)
 
 
 def plain(axes: object) -> None:
@@ -95,8 +98,8 @@ def sweep_figure(
         if trained is not None:
             band = trained if axis != "even" else np.interp(trained, np.sort(values), places[order])
             axes.axvspan(*band, color="#8a939b", alpha=0.14, linewidth=0, label="in training")
-        for method, colour in zip(methods, COLOURS, strict=False):
-            curve(axes, places[order], [lines[method][index] for index in order], method, colour)
+        for method, colour, line in zip(methods, COLOURS, LINES, strict=False):
+            curve(axes, places[order], [lines[method][index] for index in order], method, colour, line)
         axes.set_xticks(places, labels)
         axes.minorticks_off()
         axes.set_xlabel(setting, fontsize=8.5)

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.config import count
-from pipeline.errors import UserError
+from pipeline.errors import Reject, UserError
 from pipeline.keys import seed_for
 from pipeline.stage import Inputs, Item, Record
 from stages.arrays import pack_arrays, unpack_arrays
@@ -75,6 +75,8 @@ class Tokens(Probe):
         else:
             faces = worker.rng("tokens", item.id).permutation(len(scene.triangles))
         faces = faces[scene.light_index[faces] < 0]
+        if not len(faces):
+            raise Reject("dark", "the camera sees nothing that reflects")
         faces = faces if item.group == config.split else np.sort(faces[: config.triangles])
         seed = seed_for(config.seed, "probe/tokens", item.id)
         radiance, met = texel_radiance(scene, faces, spp=config.spp, seed=seed, backend=worker.renderer, size=config.size)
