@@ -58,7 +58,7 @@ def plain(axes: object) -> None:
     """Few lines, a light grid."""
     axes.grid(color=INK, alpha=0.18, linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=8)
+    axes.tick_params(labelsize=8, which="both")
 
 
 def sweep_figure(

@@ -306,10 +306,8 @@ class Sweep(Probe):
             notes.append(f"{left} scene(s) left out: dark, or the camera too close to something, at one of the values.")
         errors = [row["error"] for row in rows if row["error"] is not None]
         if errors:
-            spp = [row["spp"] for row in rows]
-            notes.append(
-                f"References: {min(spp)} to {max(spp)} samples per pixel, mean estimated log error {np.mean(errors):.4f}."
-            )
+            spp = span([row["spp"] for row in rows])
+            notes.append(f"References: {spp} samples per pixel, mean estimated log error {np.mean(errors):.4f}.")
         notes += [*self.notes(config), *self._changes(config.values, methods, scores)]
         return Outcome(columns, table, figure, notes)
 
@@ -340,6 +338,11 @@ class Sweep(Probe):
 def slug(value: float) -> str:
     """A value as part of an item's id, without '-' ."""
     return f"{value:g}".replace(".", "p").replace("-", "m").replace("+", "")
+
+
+def span(numbers: Sequence[int]) -> str:
+    """'16 to 256', or '16' where all are equal."""
+    return " to ".join(f"{number:,}" for number in sorted({min(numbers), max(numbers)}))
 
 
 def interval(name: str, found: Mapping[str, float]) -> str:

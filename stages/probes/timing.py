@@ -1,7 +1,7 @@
 """timing and equal_time: what a picture costs, by stage and against the path tracer (paper, table 2 and figure 5).
 
 Images, metrics and operation counts are records; times are taken as the figure is made, one after the other in the main
-process, after a run that warms up, the median of several. One design choice: the path tracer's time is that of
+process, after a run that warms up, the fastest of several. One design choice: the path tracer's time is that of
 ``render_views``, scene building included, and the network's that of reading the scene's arrays, encoding and decoding.
 """
 
@@ -20,7 +20,7 @@ from pipeline.stage import Inputs, Item, Record
 from stages.arrays import pack_json, unpack_json
 from stages.metrics import METRICS
 from stages.probes import edits
-from stages.probes.probe import SHOWN, Outcome, Probe, ProbeConfig, Worker, interval, slug
+from stages.probes.probe import SHOWN, Outcome, Probe, ProbeConfig, Worker, interval, slug, span
 from stages.probes.sweeps import at_least
 from stages.records import SceneRecord
 
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 
 
 def seconds(work: Callable[[], Any], repeats: int) -> float:
-    """Median wall time of ``repeats`` calls after one that warms up."""
+    """Wall time of the fastest of ``repeats`` calls after one that warms up: what others do on the machine only adds."""
     taken = []
     for _ in range(repeats + 1):
         start = time.perf_counter()
         work()
         taken.append(time.perf_counter() - start)
-    return float(np.median(taken[1:]))
+    return min(taken[1:])
 
 
 def use_threads(threads: int | None) -> int:
@@ -61,7 +61,10 @@ def synchronised(worker: Worker, work: Callable[[], Any]) -> Callable[[], Any]:
 
 
 def machine(worker: Worker, threads: int) -> str:
-    return f"network on {worker.device} with {threads} thread(s), path tracer on {worker.renderer['backend']}"
+    """Where times were taken, and whether the machine had other things to do."""
+    told = f"network on {worker.device} with {threads} thread(s), path tracer on {worker.renderer['backend']}"
+    load, cores = os.getloadavg()[0], os.cpu_count() or 1
+    return told + (f" (the machine was busy, load {load:.1f} on {cores} cores: times too long)" if load > 1.5 * cores else "")
 
 
 # --- time by stage ----------------------------------------------------------------------------------------------------
@@ -152,8 +155,8 @@ class Timing(Probe):
             plain(axes)
             axes.legend(fontsize=7.5, frameon=False)
         notes = [
-            f"{config.resolution} px; {machine(worker, threads)}; median of {config.repeats} after a warm-up. Triangles are "
-            "cut in two until there are so many; the picture stays the same.",
+            f"{config.resolution} px; {machine(worker, threads)}; the fastest of {config.repeats} after a warm-up. Triangles "
+            "are cut in two until there are so many; the picture stays the same.",
             "View-independent: reading the arrays and encoding; view-dependent: decoding one view. Frames: other cameras of a "
             "static scene, encoded once, keys and values projected once.",
         ]
@@ -241,7 +244,7 @@ class EqualTime(Probe):
     def finish(self, worker: Worker, draft: Draft) -> Outcome:
         from stages.evaluation.statistics import bootstrap
         from stages.exr import decode_rgb
-        from stages.probes.figures import COLOURS, WIDTH, new_figure, plain, strip
+        from stages.probes.figures import COLOURS, LEAST_WIDTH, new_figure, plain, strip
 
         config = worker.config
         threads = use_threads(config.threads)
@@ -272,12 +275,12 @@ class EqualTime(Probe):
         equal = {
             method: min(config.values, key=lambda spp, m=method: abs(np.log(traced_s[m, spp] / model_s))) for method in TRACED
         }
-        titles = ["reference", f"network, {model_s:.3f} s"]
+        titles = ["reference", f"network,\n{model_s:.3f} s"]
         titles += [f"{m},\n{s:g} samples, {traced_s[m, s]:.3f} s" for m, s in equal.items()]
         shown = ids[:2]
-        side = (WIDTH - 4.2) / len(titles)
-        figure = new_figure(max(len(shown) * (side + 0.35) + 0.3, 3.3))
-        outer = figure.add_gridspec(1, 2, width_ratios=[WIDTH - 4.2, 4.2])
+        side = (LEAST_WIDTH - 0.3) / len(titles)
+        figure = new_figure(len(shown) * (side + 0.05) + 0.6 + 3.0, LEAST_WIDTH)
+        outer = figure.add_gridspec(2, 1, height_ratios=[len(shown) * (side + 0.05) + 0.6, 3.0])
         pictures = outer[0].subgridspec(len(shown), 1)
         for number, id in enumerate(shown):
             record = draft.read(id)
@@ -306,9 +309,9 @@ class EqualTime(Probe):
         )
         notes = [
             f"{len(facts)} {config.split} scene(s) at {config.resolution} px; {machine(worker, threads)}; times of the first "
-            f"scene, median of {config.repeats} after a warm-up.",
+            f"scene, the fastest of {config.repeats} after a warm-up.",
             f"The counts nearest to the network's {model_s:.3f} s: {ratios}.",
-            f"References: {min(f['spp'] for f in facts)} to {max(f['spp'] for f in facts)} samples per pixel, denoised.",
+            f"References: {span([fact['spp'] for fact in facts])} samples per pixel, denoised.",
         ]
         return Outcome(columns, rows, figure, notes)
 
