@@ -50,6 +50,9 @@ class Made(Sweep):
     def scene_ids(self, config: Any, inputs: Inputs) -> list[str]:
         return [f"made-{number:02d}" for number in range(config.scenes)]
 
+    def scope(self, config: Any) -> str:
+        return f"scene(s) made for the probe, one view each at {config.resolution} px"
+
     def scene(self, worker: Worker, scene_id: str, value: float) -> SceneRecord:
         """From random numbers that are the same for every value."""
         plan, solids = self.plan(worker.rng(self.name, scene_id), value, worker.config)

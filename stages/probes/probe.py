@@ -196,6 +196,10 @@ class Sweep(Probe):
     def label(self, value: float) -> str:
         return f"{value:g}"
 
+    def scope(self, config: Any) -> str:
+        """What the table's averages are over, after their number."""
+        return f"{config.split} scene(s), one view each at {config.resolution} px"
+
     def notes(self, config: Any) -> list[str]:
         """What a reader has to know besides."""
         return []
@@ -300,7 +304,7 @@ class Sweep(Probe):
             self.trained(worker.trained_with),
             self.axis,
         )  # fmt: skip
-        notes = [f"{len(whole)} {config.split} scene(s), one view each at {config.resolution} px; 95 % intervals over scenes."]
+        notes = [f"{len(whole)} {self.scope(config)}; 95 % intervals over scenes."]
         if len(whole) < len(asked):
             left = len(asked) - len(whole)
             notes.append(f"{left} scene(s) left out: dark, or the camera too close to something, at one of the values.")

@@ -251,6 +251,9 @@ class Resolution(Sweep):
     def resolution(self, config: ResolutionConfig, value: float) -> int:
         return int(value)
 
+    def scope(self, config: ResolutionConfig) -> str:
+        return f"{config.split} scene(s), one view each"
+
     def trained(self, trained_with: Mapping[str, str]) -> tuple[float, float] | None:
         side = float(trained_with["resolution"]) if "resolution" in trained_with else None
         return None if side is None else (side * 0.95, side * 1.05)
