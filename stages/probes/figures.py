@@ -100,6 +100,8 @@ def sweep_figure(
             axes.axvspan(*band, color="#8a939b", alpha=0.14, linewidth=0, label="in training")
         for method, colour, line in zip(methods, COLOURS, LINES, strict=False):
             curve(axes, places[order], [lines[method][index] for index in order], method, colour, line)
+        if places[0] > places[-1]:  # as the columns run
+            axes.invert_xaxis()
         axes.set_xticks(places, labels)
         axes.minorticks_off()
         axes.set_xlabel(setting, fontsize=8.5)
