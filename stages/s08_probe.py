@@ -38,7 +38,7 @@ class RunProbe(MapStage):
     inputs = ("decimate", "shard", "train")
     Config = Annotated[reduce(lambda a, b: a | b, [probe.Config for probe in PROBES.values()]), Field(discriminator="name")]
     reasons = {
-        "dark": "the mean radiance of the reference is under 0.01",
+        "dark": "no light reaches the camera",
         "too_close": "something is nearer to the camera than 0.01 scene units",
     }
 

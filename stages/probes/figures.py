@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from stages.metrics import METRICS
 from stages.tonemap import exposure_for, to_picture
 
 DPI = 110
@@ -70,11 +69,13 @@ def sweep_figure(
     curves: Mapping[str, Mapping[str, Sequence[Mapping[str, float]]]],
     trained: tuple[float, float] | None,
     axis: str,
+    headings: Mapping[str, str],
 ) -> Figure:
     """Strips above (reference, then each method, by value), curves of metrics below.
 
     pictures: scene -> rows of (H, W, 3) radiance by value. curves: metric -> method -> mean and interval by value.
     ``trained``: the values that training had, shaded. axis: linear, log or even (values side by side).
+    headings: of the metrics.
     """
     side = min((WIDTH - 0.8) / len(values), MOST_SIDE)
     heights = [len(scene) * (side + 0.05) + 0.25 for scene in pictures.values()]
@@ -105,7 +106,7 @@ def sweep_figure(
         axes.set_xticks(places, labels)
         axes.minorticks_off()
         axes.set_xlabel(setting, fontsize=8.5)
-        axes.set_ylabel(METRICS[name].heading, fontsize=8.5)
+        axes.set_ylabel(headings[name], fontsize=8.5)
         plain(axes)
         if number == 0 and (len(methods) > 1 or trained is not None):
             axes.legend(fontsize=7.5, frameon=False)

@@ -32,8 +32,10 @@ if TYPE_CHECKING:
     from pipeline.store import Draft
     from stages.records import ViewRecord
 
-CURVES = ("psnr", "log_error")  # metrics that a sweep's figure draws
-SHOWN = ("psnr", "ssim", "log_error", "flip")  # and that tables show; the records hold all
+SURFACES = "log_error_surfaces"  # the black around a scene is easy, and its share changes with what is varied
+CURVES = ("psnr", SURFACES)  # metrics that a sweep's figure draws
+SHOWN = ("psnr", "ssim", "log_error", SURFACES, "flip")  # and that tables show; the records hold all
+HEADINGS = {name: metric.heading for name, metric in METRICS.items()} | {SURFACES: "log error on surfaces\u00a0↓"}
 
 
 class ProbeConfig(StageConfig):
@@ -213,7 +215,6 @@ class Sweep(Probe):
 
     def process(self, worker: Worker, item: Item) -> Iterator[Record]:
         from stages.exr import encode_rgb
-        from stages.metrics import measure_all
 
         config = worker.config
         scene_id, _, name = item.id.rpartition("-")
@@ -221,14 +222,16 @@ class Sweep(Probe):
         resolution = self.resolution(config, value)
         scene = self.scene(worker, scene_id, value)
         view = worker.trace(scene, resolution)
-        if view.meta["status"] != "ok":
-            raise Reject(view.meta["status"], f"mean radiance {view.meta['mean']:.4f}, nearest {view.meta['nearest']}")
+        if view.meta["status"] == "too_close":
+            raise Reject("too_close", f"nearest {view.meta['nearest']}")
+        if not view.image.any():
+            raise Reject("dark", "no light reaches the camera")
         scores, members = {}, {"reference.exr": encode_rgb(view.image)}
         for number, (method, predicted) in enumerate(
             self.methods(worker, lambda edited: worker.predict(edited, resolution), scene).items()
         ):
             image = predicted()
-            scores[method] = measure_all(view.image, image)
+            scores[method] = measure(view, image)
             members[f"method{number}.exr"] = encode_rgb(image)
         facts = {
             "scene": scene_id,
@@ -277,7 +280,7 @@ class Sweep(Probe):
             if name != self.setting and len({mean(name, value) for value in config.values}) > 1
         ]
         columns = [self.setting, *(["method"] if len(methods) > 1 else []), *facts]
-        columns += [METRICS[name].heading for name in SHOWN]
+        columns += [HEADINGS[name] for name in SHOWN]
         table = []
         for value in config.values:
             for method in methods:
@@ -303,6 +306,7 @@ class Sweep(Probe):
             {name: {m: [summary[m, v, name] for v in config.values] for m in methods} for name in CURVES},
             self.trained(worker.trained_with),
             self.axis,
+            HEADINGS,
         )  # fmt: skip
         notes = [f"{len(whole)} {self.scope(config)}; 95 % intervals over scenes."]
         if len(whole) < len(asked):
@@ -339,6 +343,16 @@ class Sweep(Probe):
         return out
 
 
+def measure(reference: ViewRecord, image: np.ndarray) -> dict[str, float]:
+    """Every metric, and the log error of the pixels that mostly see a surface."""
+    from stages.metrics import log_error, measure_all
+
+    surface = reference.coverage > 0.5
+    # one row of pixels; without any, nothing was got wrong
+    error = log_error(reference.image[surface], image[surface]) if surface.any() else 0.0
+    return measure_all(reference.image, image) | {SURFACES: round(error, 6)}
+
+
 def slug(value: float) -> str:
     """A value as part of an item's id, without '-' ."""
     return f"{value:g}".replace(".", "p").replace("-", "m").replace("+", "")
@@ -351,6 +365,6 @@ def span(numbers: Sequence[int]) -> str:
 
 def interval(name: str, found: Mapping[str, float]) -> str:
     """A metric's mean and its interval as text."""
-    metric = METRICS[name]
+    metric = METRICS["log_error" if name == SURFACES else name]
     mean, low, high = (metric.format(found[key]) for key in ("mean", "low", "high"))
     return f"{mean} [{low}, {high}]"

@@ -226,7 +226,7 @@ class Fov(Sweep):
         return CameraLaw().fov_deg
 
     def notes(self, config: FovConfig) -> list[str]:
-        return ["A wider view shows more of what is black around the scene, which is easy. Shaded: the released law's angles."]
+        return ["A wider view shows more black around the scene: see the error on surfaces. Shaded: the released law's angles."]
 
 
 class ResolutionConfig(ProbeConfig):

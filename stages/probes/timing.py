@@ -18,9 +18,8 @@ from pydantic import field_validator
 from pipeline.config import count, runtime
 from pipeline.stage import Inputs, Item, Record
 from stages.arrays import pack_json, unpack_json
-from stages.metrics import METRICS
 from stages.probes import edits
-from stages.probes.probe import SHOWN, Outcome, Probe, ProbeConfig, Worker, interval, slug, span
+from stages.probes.probe import HEADINGS, SHOWN, Outcome, Probe, ProbeConfig, Worker, interval, measure, slug, span
 from stages.probes.sweeps import at_least
 from stages.records import SceneRecord
 
@@ -221,7 +220,6 @@ class EqualTime(Probe):
 
     def process(self, worker: Worker, item: Item) -> Iterator[Record]:
         from stages.exr import encode_rgb
-        from stages.metrics import measure_all
 
         scene = worker.base(item.id)
         reference = worker.trace(scene)
@@ -231,10 +229,10 @@ class EqualTime(Probe):
         for number, (method, denoise) in enumerate(TRACED.items()):
             for spp in worker.config.values:
                 image = self._traced(worker, scene, spp, denoise)
-                traced.setdefault(method, {})[slug(spp)] = measure_all(reference.image, image)
+                traced.setdefault(method, {})[slug(spp)] = measure(reference, image)
                 members[f"traced{number}.s{slug(spp)}.exr"] = encode_rgb(image)
         facts = {
-            "model": measure_all(reference.image, prediction),
+            "model": measure(reference, prediction),
             "traced": traced,
             "spp": reference.meta["spp"],
             "error": reference.meta["error"],
@@ -265,7 +263,7 @@ class EqualTime(Probe):
         for method, spp in traced_s:
             found[method, spp] = summary(lambda fact, m=method, s=spp: fact["traced"][m][slug(s)])
         times = {("network", None): model_s, **traced_s}
-        columns = ["method", "samples per pixel", "seconds", *(METRICS[name].heading for name in SHOWN)]
+        columns = ["method", "samples per pixel", "seconds", *(HEADINGS[name] for name in SHOWN)]
         rows = [
             [method, "" if spp is None else f"{spp:g}", f"{times[method, spp]:.3f}"]
             + [interval(name, found[method, spp][name]) for name in SHOWN]
@@ -300,7 +298,7 @@ class EqualTime(Probe):
         axes.errorbar([model_s], [model["mean"]], error, color=COLOURS[0], marker="s", capsize=3, label="network")
         axes.set(xscale="log", yscale="log")
         axes.set_xlabel("seconds per picture (numbers: samples per pixel)", fontsize=8.5)
-        axes.set_ylabel(METRICS["log_error"].heading, fontsize=8.5)
+        axes.set_ylabel(HEADINGS["log_error"], fontsize=8.5)
         plain(axes)
         axes.legend(fontsize=7.5, frameon=False)
         ratios = ", ".join(
