@@ -13,7 +13,11 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 READY := $(VENV)/ready-$(TORCH)
 
-.PHONY: help setup data train eval test lint
+PROBES := $(basename $(notdir $(wildcard conf/probe/*.yaml)))
+EMPTY :=
+COMMA := ,
+
+.PHONY: help setup data train eval probes test lint
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
 
@@ -21,6 +25,7 @@ help:
 	@echo "make data      meshes -> shards   (stages collect remesh decimate scene render shard)"
 	@echo "make train     shards -> a trained model"
 	@echo "make eval      model and held-out shards -> an HTML report"
+	@echo "make probes    all probes of the model, each a figure and a table (docs/probes.md)"
 	@echo "make test      the tests          (TESTS=tests/model for some of them)"
 	@echo "make lint      ruff"
 	@echo "make setup     only create $(VENV) and install what is missing"
@@ -56,6 +61,9 @@ train: setup
 
 eval: setup
 	@$(RUN) -m pipeline stage=evaluate $(ARGS)
+
+probes: setup
+	@$(RUN) -m pipeline stage=probe probe=$(subst $(EMPTY) $(EMPTY),$(COMMA),$(PROBES)) -m $(ARGS)
 
 test: setup
 	@$(RUN) -m pytest $(TESTS)

@@ -10,6 +10,7 @@ SYSTEM = System(
     modules={
         **{name: module for name, module in RENDERFORMER.modules.items() if name not in BEFORE},
         "scene": "stages.s03_import:ImportScene",
+        "probe": "stages.s08_probe:ProbeImported",
     },
     groups=(*RENDERFORMER.groups, *BEFORE),
     packages=RENDERFORMER.packages,

@@ -13,6 +13,7 @@ SYSTEM = System(
         "shard": "stages.s05_shard:Shard",
         "train": "stages.s06_given:TrainOrGiven",
         "evaluate": "stages.s07_evaluate:Evaluate",
+        "probe": "stages.s08_probe:RunProbe",
     },
     groups=("model",),
     packages=(

@@ -94,6 +94,14 @@ def test_sweep_trains_variants_on_the_same_data(first, folder):
     assert len({a.manifest["preimage"]["inputs"]["shard"] for a in trained}) == 1
 
 
+def test_a_probe_with_one_more_value_computes_only_that(first, folder):
+    words = ["stage=probe", "probe=fov", "probe.scenes=1", "probe.resolution=16", "probe.max_spp=2"]
+    once = run(folder, *words, "probe.values=[45]")
+    figure = Path(once.strip().splitlines()[-1].partition(": ")[2])
+    assert figure.is_file() and json.loads((figure.parent / "probe.json").read_text())["name"] == "fov"
+    assert "2 items, 1 of them already there" in run(folder, *words, "probe.values=[45,90]")
+
+
 TINY = [
     "model.num_heads=1", "model.dim_feedforward=512", "model.num_layers=1", "model.view_transformer_latent_dim=128",
     "model.view_transformer_n_heads=1", "model.view_transformer_ffn_hidden_dim=512", "model.view_transformer_n_layers=4",
