@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from pipeline.__main__ import sweep_keys
 from pipeline.config import parse
 from pipeline.errors import UserError
 from pipeline.hydra_config import CONF, compose
 from pipeline.stage import load_system
+from pipeline.sweep import sweep_keys
 
 ROOT = Path(__file__).resolve().parents[2]
 SYSTEM = load_system("renderformer")
