@@ -1,4 +1,5 @@
 # make data train eval    the whole line on the embedded default; any combination works
+# make sweep              table 1 of the paper, small: twelve variants over one dataset, and the table
 # make test               the tests
 # Everything installs itself into .venv. All targets are phony: the store decides what is stale.
 
@@ -8,12 +9,13 @@ TORCH ?= $(shell nvidia-smi >/dev/null 2>&1 && echo cuda || echo cpu)
 TORCH_VERSION := 2.13.0
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 ARGS ?=
+TABLE ?= table1_small
 
 VENV := .venv
 RUN := $(VENV)/bin/python
 READY := $(VENV)/ready-$(TORCH)
 
-.PHONY: help setup data train eval test lint
+.PHONY: help setup data train eval sweep test lint
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
 
@@ -21,6 +23,7 @@ help:
 	@echo "make data      meshes -> shards   (stages collect remesh decimate scene render shard)"
 	@echo "make train     shards -> a trained model"
 	@echo "make eval      model and held-out shards -> an HTML report"
+	@echo "make sweep     table 1 of the paper at small size: twelve variants, one dataset, runs/table1_small/table.md"
 	@echo "make test      the tests          (TESTS=tests/model for some of them)"
 	@echo "make lint      ruff"
 	@echo "make setup     only create $(VENV) and install what is missing"
@@ -56,6 +59,9 @@ train: setup
 
 eval: setup
 	@$(RUN) -m pipeline stage=evaluate $(ARGS)
+
+sweep: setup
+	@$(RUN) -m stages.cli sweep $(TABLE) $(ARGS)
 
 test: setup
 	@$(RUN) -m pytest $(TESTS)

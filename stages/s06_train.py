@@ -13,6 +13,7 @@ import itertools
 import json
 import shutil
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -277,15 +278,39 @@ A100_TFLOPS = {"float32": 156.0, "bfloat16": 312.0}  # its data sheet's, float32
 UTILISATION = 0.4  # of that, assumed
 
 
-def estimate(config: TrainConfig, configs: Mapping[str, StageConfig]) -> list[str]:
-    """What data and training cost, at most: every scene as large as allowed, every pixel with all its samples."""
+@dataclass(frozen=True)
+class Cost:
+    """Of a whole training run: floating-point operations, and days of one A100 at `UTILISATION`."""
+
+    flops: float
+    days: float
+
+
+def sizes(config: TrainConfig, configs: Mapping[str, StageConfig]) -> tuple[int | None, int | None]:
+    """Pixels per side and most triangles of a scene; None where the data does not say."""
+    largest = config.max_triangles or getattr(configs.get("scene"), "max_triangles", None)
+    return getattr(configs.get("render"), "resolution", None), largest
+
+
+def cost(config: TrainConfig, configs: Mapping[str, StageConfig]) -> Cost | None:
+    """With every scene as large as allowed; None where the data does not say how large that is."""
     from model.flops import TRAINING, forward_flops, ideal_seconds
 
+    side, largest = sizes(config, configs)
+    if side is None or largest is None:
+        return None
+    flops = forward_flops(config.model.build(), [largest], config.views_per_scene, side, side)
+    peaks = {name: value * 1e12 * UTILISATION for name, value in A100_TFLOPS.items()}
+    scenes = TRAINING * config.batch_scenes * config.steps
+    return Cost(scenes * sum(flops.values()), scenes * ideal_seconds(flops, peaks, config.precision) / 86400)
+
+
+def estimate(config: TrainConfig, configs: Mapping[str, StageConfig]) -> list[str]:
+    """What data and training cost, at most: every scene as large as allowed, every pixel with all its samples."""
     lines = []
     network = config.model.build()
     scene, render = configs.get("scene"), configs.get("render")
-    side = getattr(render, "resolution", None)
-    largest = config.max_triangles or getattr(scene, "max_triangles", None)
+    side, largest = sizes(config, configs)
     if hasattr(scene, "count") and render is not None:
         images = sum(scene.count.model_dump().values()) * scene.cameras.views
         adaptive = f", fewer where the error is under {render.target_error:g}" if render.target_error else ""
@@ -296,20 +321,17 @@ def estimate(config: TrainConfig, configs: Mapping[str, StageConfig]) -> list[st
             f"(at most {render.max_spp:,} per pixel{adaptive})",
             f"visits: {visits:.1f} of each training scene",
         ]
-    if side is None or largest is None:
+    paid = cost(config, configs)
+    if paid is None:
         return [*lines, "training: cost unknown, the data does not say its resolution or its triangles"]
-    flops = forward_flops(network, [largest], config.views_per_scene, side, side)
-    step = TRAINING * sum(flops.values()) * config.batch_scenes
     rays = config.views_per_scene * (side // network.patch_size) ** 2
     tokens = (largest + network.num_register_tokens + rays) * config.batch_scenes
-    peaks = {name: value * 1e12 * UTILISATION for name, value in A100_TFLOPS.items()}
-    days = TRAINING * ideal_seconds(flops, peaks, config.precision) * config.batch_scenes * config.steps / 86400
     return [
         *lines,
         f"training: {config.steps:,} steps of {config.batch_scenes} scenes x {config.views_per_scene} views, "
         f"{tokens:,} tokens a step, {tokens * config.steps:.2e} in all",
-        f"compute: {step:.2e} FLOPs a step, {step * config.steps:.2e} in all; {days:.3g} days of one A100, {days / 8:.3g} of "
-        f"eight (at {UTILISATION:.0%} of its peak, {config.precision} precision)",
+        f"compute: {paid.flops / config.steps:.2e} FLOPs a step, {paid.flops:.2e} in all; {paid.days:.3g} days of one A100, "
+        f"{paid.days / 8:.3g} of eight (at {UTILISATION:.0%} of its peak, {config.precision} precision)",
         "start: "
         + (f"from {config.init_from}" if config.init_from else "from scratch (train.init_from=FOLDER: from another run)"),
     ]
