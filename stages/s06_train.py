@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from pipeline.config import Section, StageConfig, added, runtime
 from pipeline.errors import UserError
@@ -62,6 +62,11 @@ class ModelSection(Section):
     dpt_out_channels: tuple[int, ...] = (96, 192, 384, 768)
     dpt_out_layers: tuple[int, ...] | None = None
 
+    @model_validator(mode="after")
+    def _computable(self) -> ModelSection:
+        self.build()
+        return self
+
     def build(self) -> ModelConfig:
         """As the network's own config, which refuses what it cannot compute."""
         from model.config import ModelConfig
@@ -92,7 +97,8 @@ class TrainConfig(StageConfig):
     lpips: float = Field(0.0, ge=0)
     # Share of the gradient that pixels below 0 get besides ELU's own 1e-3: at high learning rates the output else dies
     gradient_leak: float = Field(0.1, ge=0, le=1)
-    informed_start: bool = True  # initial values that say what is known (model.initial), for runs of minutes
+    # Initial values that say what is known (model.initial), for runs of minutes; inputs: of materials and normals, not of rays
+    informed_start: bool | Literal["inputs"] = True
     # Augmentation
     rotate: bool = False  # turn the scene at random: the view-independent stage must not learn an orientation
     translate_sigma: float = Field(0.0, ge=0)  # and move it; scene units
@@ -120,6 +126,16 @@ class TrainConfig(StageConfig):
     pictures: int = runtime(6, ge=0)  # validation scenes that are shown
     checkpoint_every: int = runtime(100, ge=1)
     tensorboard: bool = runtime(True)  # events besides log.jsonl
+
+    @model_validator(mode="after")
+    def _startable(self) -> TrainConfig:
+        model = self.model
+        if self.informed_start is True and self.init_from is None and not (model.pe_type == "rope" and model.turn_to_cam_coord):
+            raise ValueError(
+                f"informed_start=true aims rays by rotary positions in the camera frame, which {model.name} does not have: "
+                "set train.informed_start=inputs or false"
+            )
+        return self
 
     def batches(self) -> BatchConfig:
         """The loader's part: the fields of the same names."""
@@ -245,7 +261,7 @@ def start(model: RenderFormer, config: TrainConfig) -> None:
         if config.informed_start:
             from model.initial import start_informed
 
-            start_informed(model)
+            start_informed(model, rays=config.informed_start is True)
         return
     from model import checkpoint
 
