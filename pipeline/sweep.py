@@ -164,8 +164,6 @@ def _make_shared(job: Job, shared: Mapping[str, str], command: Sequence[str], ou
     run = split_config(job.root)[0]
     forced = [name for name in run.force if name in shared]
     if forced:
-        raise UserError(
-            f"force={','.join(forced)} is shared by all jobs of the sweep: force it once, then run the sweep without"
-        )
+        raise UserError(f"force={','.join(forced)}: all jobs of the sweep share it; force it by itself, then run the sweep")
     read = {parent for name in shared for parent in job.plan[name].stage.reads(job.plan[name].config)}
     run_pipeline({**job.root, "stage": [name for name in shared if name not in read], "force": []}, command, out)

@@ -42,7 +42,7 @@ def test_yaml_names_every_field_of_its_config(stage, variant):
 
 @pytest.mark.parametrize("model", sorted(path.stem for path in (CONF / "model").glob("*.yaml")))
 def test_every_model_is_a_valid_config(model):
-    parse(SYSTEM.stage("train").Config, compose([f"model={model}"])["train"], "train")
+    parse(SYSTEM.stage("train").Config, compose([f"model={model}", "train.informed_start=inputs"])["train"], "train")
 
 
 @pytest.mark.parametrize(

@@ -24,15 +24,16 @@ def run(folder: Path, *words: str, **variables: str) -> subprocess.CompletedProc
 
 @pytest.fixture
 def folders(tmp_path) -> tuple[Path, Path]:
-    """One with enough different meshes, one with none."""
-    good, empty = tmp_path / "good", tmp_path / "empty"
+    """One with enough different meshes for three splits, one with a single mesh."""
+    good, few = tmp_path / "good", tmp_path / "few"
     good.mkdir()
-    empty.mkdir()
+    few.mkdir()
     for number in range(6):
         corners = [(0, 0, 0), (1 + number, 0, 0), (0, 1, 0), (0, 0, 1 + number**2)]
         lines = [f"v {x} {y} {z}" for x, y, z in corners] + ["f 1 3 2", "f 1 2 4", "f 2 3 4", "f 3 1 4"]
         (good / f"{number}.obj").write_text("\n".join(lines) + "\n")
-    return good, empty
+    (few / "0.obj").write_bytes((good / "0.obj").read_bytes())
+    return good, few
 
 
 def test_sweep_keys_are_known_before_it_runs(tmp_path):
@@ -60,14 +61,14 @@ def test_what_jobs_share_is_said(tmp_path):
 
 
 def test_a_failed_job_leaves_the_others_and_is_taken_up_again(tmp_path, folders):
-    good, empty = folders
-    words = ["stage=collect", "collect=folder", f"collect.path={empty},{good}", "jobs=2", "-m"]
+    good, few = folders
+    words = ["stage=collect", "collect=folder", f"collect.path={few},{good}", "jobs=2", "-m"]
     done = run(tmp_path, *words)
     assert done.returncode == 2, done.stdout + done.stderr
-    assert done.stderr.splitlines()[-1].startswith(f"error: 1 of 2 jobs failed: {empty}; the others are done")
+    assert done.stderr.splitlines()[-1].startswith(f"error: 1 of 2 jobs failed: {few}; the others are done")
     assert f"{good} " in done.stdout and len(Store(tmp_path / "store").artifacts("collect")) == 1
     for path in good.iterdir():
-        (empty / path.name).write_bytes(path.read_bytes() + b"v 9 9 9\n")  # another source, so another artifact
+        (few / path.name).write_bytes(path.read_bytes() + b"v 9 9 9\n")  # another source, so another artifact
     again = run(tmp_path, *words)
     assert again.returncode == 0, again.stdout + again.stderr
     assert again.stdout.count("up to date") == 1 and len(Store(tmp_path / "store").artifacts("collect")) == 2
