@@ -19,6 +19,7 @@ from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 
 from pipeline.errors import UserError
 from pipeline.executor import THREAD_VARIABLES
@@ -62,13 +63,13 @@ def is_hydras(word: str) -> bool:
 
 def expand(overrides: Sequence[str]) -> list[Job]:
     """The jobs of a sweep, in Hydra's order."""
-    parsed = OverridesParser.create().parse_overrides([word for word in overrides if not is_hydras(word)])
-    jobs = []
-    for batch in BasicSweeper.split_arguments(parsed, None):
-        for words in batch:
-            root = compose(words)
-            jobs.append(Job(tuple(words), root, plan_of(root)))
-    return jobs
+    try:
+        parsed = OverridesParser.create().parse_overrides([word for word in overrides if not is_hydras(word)])
+        batches = BasicSweeper.split_arguments(parsed, None)
+    except HydraException as error:
+        raise UserError(str(error).splitlines()[0]) from None
+    roots = [(tuple(words), compose(words)) for batch in batches for words in batch]
+    return [Job(words, root, plan_of(root)) for words, root in roots]
 
 
 def sweep_keys(overrides: Sequence[str]) -> dict[str, dict[str, str]]:
@@ -110,8 +111,7 @@ def run_side_by_side(
     jobs: Sequence[Job], at_once: int, hydra_words: Sequence[str], command: Sequence[str], out: Callable[[str], None]
 ) -> dict[str, int]:
     """Run the jobs ``at_once`` at a time in processes of their own; returns the exit status of each by its label."""
-    store = Store(split_config(jobs[0].root)[0].store)
-    todo = [job for job in jobs if not _complete(job, store)]
+    todo = [job for job in jobs if not _complete(job)]
     shared = shared_stages(jobs)
     if todo and shared:
         _make_shared(jobs[0], shared, command, out)
@@ -154,8 +154,9 @@ def live_with_the_sweep() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _complete(job: Job, store: Store) -> bool:
+def _complete(job: Job) -> bool:
     run = split_config(job.root)[0]
+    store = Store(run.store)
     return not run.force and all(store.find(name, job.plan[name].key) is not None for name in run.stage)
 
 

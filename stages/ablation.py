@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 COLUMNS = {"psnr": "PSNR", "ssim": "SSIM", "lpips_vgg": "LPIPS", "flip": "FLIP"}  # our metric -> the paper's column
 DRAWN = ("psnr", "flip")  # columns of the figure
+INTERRUPTED = 130  # exit status after Ctrl-C
 BASE = "full"  # the row that the others are held against
 
 
@@ -119,19 +120,18 @@ def sweep(table: str, names: Sequence[str] | None, overrides: Sequence[str], out
         costs[name] = cost(configs["train"], configs)
     # the dearest first, so that the last ones fill the gaps
     order = sorted(jobs, key=lambda name: -getattr(costs[name], "days", 0))
-    planned = split_config(next(iter(jobs.values())).root)[0].plan
-    extra = []
+    at_once = []
     if not any(word.startswith("jobs=") for word in overrides):
-        extra = ["jobs=1" if choose_device("auto", "") == "cuda" else f"jobs={min(len(jobs), os.cpu_count() or 1)}"]
-    status = run_main([*words(table, order), *overrides, *extra, "-m"])
-    if planned:
+        at_once = ["jobs=1" if choose_device("auto", "") == "cuda" else f"jobs={min(len(jobs), os.cpu_count() or 1)}"]
+    status = run_main([*words(table, order), *overrides, *at_once, "-m"])
+    if split_config(next(iter(jobs.values())).root)[0].plan:
         known = [one for one in costs.values() if one]
         print(
             f"in all: {len(known)} rows, {sum(one.flops for one in known):.2e} FLOPs of training, "
             f"{sum(one.days for one in known):.3g} days of one A100"
         )
         return status
-    return max(status, write_table(table, names, overrides, out))
+    return status if status == INTERRUPTED else max(status, write_table(table, names, overrides, out))
 
 
 # --- what the store holds -----------------------------------------------------------------------------------------------------
@@ -194,23 +194,26 @@ def settings(job: Job, result: Result | None) -> dict[str, str]:
             ("relighting", train.relight), ("exposure", train.exposure_stops),
         ) if on
     ]  # fmt: skip
-    made = result.metrics["data"]["scenes"].get("train") if result else None
-    scenes = made or scene.count.train
+    asked = scene.count.model_dump() if hasattr(scene, "count") else {}  # imported scenes are as many as there are files
+    made = result.metrics["data"]["scenes"] if result else asked
+    scenes = made.get("train", 0)
     loss = "L1 of log10(1 + x)" + (f", {train.lpips:g} LPIPS" if train.lpips else "")
     peak = f"learning rate {train.lr:g}" + (f", {train.muon_lr:g} of matrices" if train.optimizer == "muon" else "")
     start = "informed" if train.informed_start is True else "random"
-    test = f"{scene.count.test:,} scenes asked for"
+    test = f"{asked.get('test', 0):,} scenes asked for"
     if result:
         test = f"{result.metrics['scenes']:,} scenes, {result.metrics['views']:,} views"
+    largest = train.max_triangles or getattr(scene, "max_triangles", None)
+    views = f", {scene.cameras.views} views per scene" if hasattr(scene, "cameras") else ""
     return {
         "training scenes": f"{scenes:,}",
-        "objects": str(config["collect"].name),
-        "triangles per scene, at most": f"{train.max_triangles or scene.max_triangles:,}",
-        "images": f"{render.resolution} px, {scene.cameras.views} views per scene",
+        "objects": config["collect"].name if asked else "of imported scenes",
+        "triangles per scene, at most": f"{largest:,}" if largest else "any",
+        "images": f"{render.resolution} px{views}",
         "samples per pixel, at most": f"{render.max_spp:,}",
         "test": test,
         "training": f"{train.steps:,} steps of {train.batch_scenes} scenes x {train.views_per_scene} views",
-        "visits of each training scene": f"{train.steps * train.batch_scenes / scenes:.3g}",
+        "visits of each training scene": f"{train.steps * train.batch_scenes / max(1, scenes):.3g}",
         "optimizer": f"{train.optimizer}, {peak}, {train.warmup:,} steps of warm-up",
         "loss": loss,
         "augmentation": ", ".join(augmentation) or "none",
@@ -317,7 +320,7 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) 
 
 def _size(row: Mapping[str, Any]) -> list[str]:
     if "ours" not in row:
-        return ["not run", "", "", row["paper_parameters"]]
+        return ["no result", "", "", row["paper_parameters"]]
     layers = " + ".join(map(str, row["layers"]))
     return [layers, str(row["width"]), f"{row['parameters'] / 1e6:.1f}M", row["paper_parameters"]]
 
@@ -344,13 +347,15 @@ def markdown(found: Mapping[str, Any]) -> str:
         if "ours" in row
     ]  # fmt: skip
     here = found["settings"]["here"]
+    measured = any("lpips_vgg" in row.get("ours", {}) for row in found["rows"])
     lines = [
         f"# Table 1 of the paper: {found['table']}",
         "",
         "The paper's figures stand beside ours to compare the order of the rows and the size of their differences, not "
         "the figures themselves: the last table says how much smaller our runs are. Means over views, with 95 % intervals "
         "under resampling of scenes. PSNR and SSIM are of linear values clamped to [0, 1], FLIP is HDR-FLIP. All rows: one "
-        f"dataset (shard {found['shard'][:12]}), one recipe, one seed, the same batches in the same order.",
+        f"dataset (shard {found['shard'][:12]}), one recipe, one seed, the same batches in the same order."
+        + ("" if measured else " LPIPS is measured where its weights are given (evaluate.lpips=vgg, docs/training.md)."),
         "",
         *_table(["variant", "layers", "width", "parameters", "paper", *columns], figures),
         "![Differences to the full model](table.png)",

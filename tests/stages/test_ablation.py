@@ -138,7 +138,7 @@ def test_the_table_says_what_ran_what_did_not_and_what_differs(monkeypatch, tmp_
     text = (tmp_path / "out" / "table.md").read_text()
     assert "| full model | 8 + 4 | 384 | 33.0M | 205M | 20.00 [0.00, 1.00] | 29.77 |" in text
     assert "| without DPT | **−1.00** [−1.00, −1.00] | −0.02 |" in text
-    assert "| without self-attention | not run |" in text
+    assert "| without self-attention | no result |" in text
     assert "| training | 500,000 steps of 128 scenes x 4 views | 7 steps of" in text
     assert (tmp_path / "out" / "table.png").stat().st_size > 10_000
     assert write_table("table1_small", ["full", "no_dpt"], words, tmp_path / "out") == 0
@@ -147,7 +147,7 @@ def test_the_table_says_what_ran_what_did_not_and_what_differs(monkeypatch, tmp_
 def test_a_table_without_results_is_still_the_papers(jobs):
     table = "table1_small" if network(jobs, "full").latent_dim == 384 else "table1"
     text = markdown(gather(table, jobs))
-    assert text.count("not run") == 12 and "29.77" in text
+    assert text.count("no result") == 12 and "29.77" in text
     assert settings(jobs["full"], None).keys() == PAPER.keys()
     if table == "table1":  # what the configs can say of the paper's size is the paper's
         here, paper = settings(jobs["full"], None), dict(PAPER)
