@@ -1,4 +1,5 @@
 # make data train eval    the whole line on the embedded default; any combination works
+# make sweep              table 1 of the paper, small: twelve variants over one dataset, and the table
 # make test               the tests
 # Everything installs itself into .venv. All targets are phony: the store decides what is stale.
 
@@ -8,6 +9,7 @@ TORCH ?= $(shell nvidia-smi >/dev/null 2>&1 && echo cuda || echo cpu)
 TORCH_VERSION := 2.13.0
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 ARGS ?=
+TABLE ?= table1_small
 
 VENV := .venv
 RUN := $(VENV)/bin/python
@@ -17,7 +19,7 @@ PROBES := $(basename $(notdir $(wildcard conf/probe/*.yaml)))
 EMPTY :=
 COMMA := ,
 
-.PHONY: help setup data train eval probes test lint
+.PHONY: help setup data train eval sweep probes test lint
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
 
@@ -26,6 +28,7 @@ help:
 	@echo "make train     shards -> a trained model"
 	@echo "make eval      model and held-out shards -> an HTML report"
 	@echo "make probes    all probes of the model, each a figure and a table (docs/probes.md)"
+	@echo "make sweep     table 1 of the paper at small size: twelve variants, one dataset, runs/table1_small/table.md"
 	@echo "make test      the tests          (TESTS=tests/model for some of them)"
 	@echo "make lint      ruff"
 	@echo "make setup     only create $(VENV) and install what is missing"
@@ -64,6 +67,9 @@ eval: setup
 
 probes: setup
 	@$(RUN) -m pipeline stage=probe probe=$(subst $(EMPTY) $(EMPTY),$(COMMA),$(PROBES)) -m $(ARGS)
+
+sweep: setup
+	@$(RUN) -m stages.cli sweep $(TABLE) $(ARGS)
 
 test: setup
 	@$(RUN) -m pytest $(TESTS)

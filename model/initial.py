@@ -9,6 +9,7 @@ cos f_i (coordinate - x), largest at the triangle.
 Materials and normals: reflectances vary by less than the constants beside them, and normals are encoded up to frequencies that
 tell neighbouring triangles apart but not lit from unlit ones; scaling both lets the embeddings start with what differs.
 
+Materials and normals alone (``rays=False``) suit every variant, so that a comparison of variants can give all the same start.
 Only initial values change: the network computes what it always computes (sections 3.1 and 3.2).
 """
 
@@ -29,9 +30,10 @@ MATERIAL_SCALE = 0.6  # standard deviation of the weights of those channels
 EMISSION_SCALE = 0.3  # likewise of the last three channels, log10(1 + radiance)
 
 
-def start_informed(model: RenderFormer) -> None:
-    """Set the initial values of a model with rotary positions in the camera frame, in place; random numbers are torch's."""
-    aim_rays(model)
+def start_informed(model: RenderFormer, rays: bool = True) -> None:
+    """Set the initial values in place; random numbers are torch's. ``rays`` needs rotary positions in the camera frame."""
+    if rays:
+        aim_rays(model)
     spread_materials(model)
     calm_normals(model)
 
@@ -62,8 +64,8 @@ def aim_rays(model: RenderFormer, depth: float = 1.75) -> None:
     config = model.config
     if config.pe_type != "rope" or not config.turn_to_cam_coord:
         raise ValueError(
-            "train.informed_start needs rotary positions in the camera frame (model.pe_type=rope, "
-            "model.turn_to_cam_coord=true); set train.informed_start=false for this model"
+            "train.informed_start=true needs rotary positions in the camera frame (model.pe_type=rope, "
+            "model.turn_to_cam_coord=true); set train.informed_start=false for this model, or inputs"
         )
     view, dim, pixels = model.view_transformer, config.latent_dim, config.patch_size**2
     third = dim // 3

@@ -1,7 +1,6 @@
 """``python -m pipeline stage=... [overrides] [-m]``: Hydra composes, the runner runs.
 
-``-m`` may stand anywhere: Hydra's own parser wants flags first. A sweep composes its jobs lazily, so the keys of all jobs are
-computed before the first one starts, and a job whose key has changed by then stops.
+``-m`` may stand anywhere: Hydra's own parser wants flags first. Sweeps: ``pipeline.sweep``.
 """
 
 from __future__ import annotations
@@ -12,35 +11,32 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import hydra
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from pipeline.errors import INTERRUPTED, STORAGE_ERRORS, UserError, status_of
+from pipeline.errors import INTERRUPTED, STORAGE_ERRORS, status_of
 from pipeline.hydra_config import CONF, compose, to_plain
-from pipeline.runner import make_plan, run_pipeline, split_config
-from pipeline.store import HashCache, Store
+from pipeline.runner import run_pipeline, split_config
+from pipeline.sweep import (
+    KEYS_VARIABLE,
+    check_keys,
+    describe,
+    expand,
+    is_hydras,
+    keys_of,
+    live_with_the_sweep,
+    run_side_by_side,
+)
 
-SWEEP_VARIABLE = "LIGHTMILL_SWEEP_KEYS"  # JSON: job's overrides -> keys, for the jobs of one sweep
 MULTIRUN_FLAGS = {"-m", "--multirun"}
 
 
-def plan_keys(root: dict) -> dict[str, str]:
-    run, system, sections = split_config(root)
-    plan = make_plan(run, system, sections, HashCache(Store(run.store).root / ".cache" / "hashes.json"))
-    return {name: planned.key for name, planned in plan.items()}
-
-
-def sweep_keys(overrides: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Keys of every job of a sweep, by the job's overrides."""
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    jobs = [job for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]
-    return {" ".join(job): plan_keys(compose(job)) for job in jobs}
+def say(text: str) -> None:
+    print(text, flush=True)
 
 
 @contextlib.contextmanager
@@ -83,6 +79,7 @@ def guarded(work: Callable[[], None], debug: bool = False) -> int:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Returns the exit status: 0 done, 130 interrupted, or that of the first error (see pipeline.errors)."""
+    live_with_the_sweep()
     words = list(sys.argv[1:] if words is None else words)
     debug = "--debug" in words or "debug=true" in words
     words = [word for word in words if word != "--debug"]
@@ -97,14 +94,10 @@ def main(words: Sequence[str] | None = None) -> int:
         try:
             root = to_plain(config)
             task = " ".join(HydraConfig.get().overrides.task)
-            expected = json.loads(os.environ.get(SWEEP_VARIABLE, "{}")).get(task)
             if HydraConfig.get().mode == RunMode.MULTIRUN:
-                print(f"== {task}", flush=True)
-                if expected is not None and expected != plan_keys(root):
-                    raise UserError(
-                        f"the config or a source file changed after the sweep began: job {task!r} has other keys now"
-                    )
-            run_pipeline(root, command, lambda text: print(text, flush=True))
+                say(f"== {task}")
+            check_keys(task, root)
+            run_pipeline(root, command, say)
         except ValueError as error:  # UserError, and what model/ says of bad input
             if debug:
                 raise
@@ -114,7 +107,14 @@ def main(words: Sequence[str] | None = None) -> int:
     def compose_and_run() -> None:
         if not hydra_flags:
             if flags:
-                os.environ[SWEEP_VARIABLE] = json.dumps(sweep_keys(overrides))
+                jobs = expand(overrides)
+                say(describe(jobs))
+                run = split_config(jobs[0].root)[0]
+                if run.jobs is not None and not run.plan:
+                    statuses = run_side_by_side(jobs, run.jobs, [*filter(is_hydras, overrides)], command, say)
+                    failures.extend(report(statuses))
+                    return
+                os.environ[KEYS_VARIABLE] = json.dumps({job.name: keys_of(job.plan) for job in jobs})
             else:
                 split_config(compose(overrides))  # a bad override gets our message instead of Hydra's
         sys.argv = ["lightmill", *flags[:1], *overrides]
@@ -124,8 +124,22 @@ def main(words: Sequence[str] | None = None) -> int:
     try:
         status = guarded(compose_and_run, debug)
     finally:
-        os.environ.pop(SWEEP_VARIABLE, None)
+        os.environ.pop(KEYS_VARIABLE, None)
     return status or (failures[0] if failures else 0)
+
+
+def report(statuses: Mapping[str, int]) -> list[int]:
+    """Say which jobs of a sweep failed; returns their exit statuses."""
+    failed = {name: status for name, status in statuses.items() if status}
+    if INTERRUPTED in failed.values():
+        raise KeyboardInterrupt
+    if failed:
+        print(
+            f"error: {len(failed)} of {len(statuses)} jobs failed: {', '.join(failed)}; the others are done, "
+            "and the same command continues",
+            file=sys.stderr,
+        )
+    return list(failed.values())
 
 
 if __name__ == "__main__":

@@ -54,6 +54,7 @@ class RunConfig(Section):
     force: tuple[str, ...] = ()  # stages to compute again although their artifacts exist
     plan: bool = False  # print the plan and stop
     workers: int | Literal["auto"] = Field("auto")  # worker processes; auto: one per core; 0: none, in this process
+    jobs: int | None = Field(None, ge=1)  # of a sweep at a time, each in a process of its own; None: one by one in this one
     debug: bool = False  # tracebacks instead of one-line errors
     executor: Executor = LocalExecutor()  # where parts are made
 

@@ -108,6 +108,18 @@ def command_export(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def command_sweep(arguments: argparse.Namespace) -> int:
+    from stages.ablation import sweep
+
+    return sweep(arguments.table, arguments.rows, arguments.words, Path(arguments.out or f"runs/{arguments.table}"))
+
+
+def command_table(arguments: argparse.Namespace) -> int:
+    from stages.ablation import write_table
+
+    return write_table(arguments.table, arguments.rows, arguments.words, Path(arguments.out or f"runs/{arguments.table}"))
+
+
 def command_import(arguments: argparse.Namespace) -> int:
     from pipeline.__main__ import main as run_main
 
@@ -171,6 +183,16 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("folder", help="folder of scene files; train/, validation/ and test/ in it are splits")
     sub.usage = f"{PROGRAM} import FOLDER [name=value ...] [--debug]"
 
+    for name, function, summary in (
+        ("sweep", command_sweep, "train and evaluate the rows of the paper's table 1, then write the table"),
+        ("table", command_table, "write the table of the rows that the store holds"),
+    ):
+        sub = add(name, function, summary, "table1_small --rows full,no_dpt jobs=2")
+        sub.add_argument("table", nargs="?", default="table1_small", help="folder of conf/experiment (default: table1_small)")
+        sub.add_argument("--rows", type=lambda text: text.split(","), help="some rows, comma-separated (default: all)")
+        sub.add_argument("-o", "--out", help="folder of table.md, table.json and table.png (default: runs/TABLE)")
+        sub.usage = f"{PROGRAM} {name} [TABLE] [--rows ROW,...] [-o FOLDER] [name=value ...] [--debug]"
+
     sub = add("trace", command_trace, "path trace a scene given as released JSON or HDF5", "scene.json -o out.exr --spp 256")
     sub.add_argument("scene", help="scene file: .json or .h5")
     sub.add_argument("-o", "--out", required=True, help="output .exr (linear RGB float); with --view all: OUT-0.exr, OUT-1.exr")
@@ -218,7 +240,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(words: Sequence[str] | None = None) -> int:
     """Returns the exit status: 0, or that of the error (see pipeline.errors)."""
     arguments, unknown = build_parser().parse_known_args(words)
-    if arguments.function in (command_run, command_import):
+    if arguments.function in (command_run, command_import, command_sweep, command_table):
         arguments.words = unknown  # overrides and Hydra's own flags, in any order
     elif unknown:
         build_parser().error(f"unknown arguments: {' '.join(unknown)}; see {PROGRAM} COMMAND --help")

@@ -13,10 +13,11 @@ import itertools
 import json
 import shutil
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from pipeline.config import Section, StageConfig, added, runtime
 from pipeline.errors import UserError
@@ -61,6 +62,11 @@ class ModelSection(Section):
     dpt_out_channels: tuple[int, ...] = (96, 192, 384, 768)
     dpt_out_layers: tuple[int, ...] | None = None
 
+    @model_validator(mode="after")
+    def _computable(self) -> ModelSection:
+        self.build()
+        return self
+
     def build(self) -> ModelConfig:
         """As the network's own config, which refuses what it cannot compute."""
         from model.config import ModelConfig
@@ -91,7 +97,8 @@ class TrainConfig(StageConfig):
     lpips: float = Field(0.0, ge=0)
     # Share of the gradient that pixels below 0 get besides ELU's own 1e-3: at high learning rates the output else dies
     gradient_leak: float = Field(0.1, ge=0, le=1)
-    informed_start: bool = True  # initial values that say what is known (model.initial), for runs of minutes
+    # Initial values that say what is known (model.initial), for runs of minutes; inputs: of materials and normals, not of rays
+    informed_start: bool | Literal["inputs"] = True
     # Augmentation
     rotate: bool = False  # turn the scene at random: the view-independent stage must not learn an orientation
     translate_sigma: float = Field(0.0, ge=0)  # and move it; scene units
@@ -119,6 +126,16 @@ class TrainConfig(StageConfig):
     pictures: int = runtime(6, ge=0)  # validation scenes that are shown
     checkpoint_every: int = runtime(100, ge=1)
     tensorboard: bool = runtime(True)  # events besides log.jsonl
+
+    @model_validator(mode="after")
+    def _startable(self) -> TrainConfig:
+        model = self.model
+        if self.informed_start is True and self.init_from is None and not (model.pe_type == "rope" and model.turn_to_cam_coord):
+            raise ValueError(
+                f"informed_start=true aims rays by rotary positions in the camera frame, which {model.name} does not have: "
+                "set train.informed_start=inputs or false"
+            )
+        return self
 
     def batches(self) -> BatchConfig:
         """The loader's part: the fields of the same names."""
@@ -244,7 +261,7 @@ def start(model: RenderFormer, config: TrainConfig) -> None:
         if config.informed_start:
             from model.initial import start_informed
 
-            start_informed(model)
+            start_informed(model, rays=config.informed_start is True)
         return
     from model import checkpoint
 
@@ -277,15 +294,39 @@ A100_TFLOPS = {"float32": 156.0, "bfloat16": 312.0}  # its data sheet's, float32
 UTILISATION = 0.4  # of that, assumed
 
 
-def estimate(config: TrainConfig, configs: Mapping[str, StageConfig]) -> list[str]:
-    """What data and training cost, at most: every scene as large as allowed, every pixel with all its samples."""
+@dataclass(frozen=True)
+class Cost:
+    """Of a whole training run: floating-point operations, and days of one A100 at `UTILISATION`."""
+
+    flops: float
+    days: float
+
+
+def sizes(config: TrainConfig, configs: Mapping[str, StageConfig]) -> tuple[int | None, int | None]:
+    """Pixels per side and most triangles of a scene; None where the data does not say."""
+    largest = config.max_triangles or getattr(configs.get("scene"), "max_triangles", None)
+    return getattr(configs.get("render"), "resolution", None), largest
+
+
+def cost(config: TrainConfig, configs: Mapping[str, StageConfig]) -> Cost | None:
+    """With every scene as large as allowed; None where the data does not say how large that is."""
     from model.flops import TRAINING, forward_flops, ideal_seconds
 
+    side, largest = sizes(config, configs)
+    if side is None or largest is None:
+        return None
+    flops = forward_flops(config.model.build(), [largest], config.views_per_scene, side, side)
+    peaks = {name: value * 1e12 * UTILISATION for name, value in A100_TFLOPS.items()}
+    scenes = TRAINING * config.batch_scenes * config.steps
+    return Cost(scenes * sum(flops.values()), scenes * ideal_seconds(flops, peaks, config.precision) / 86400)
+
+
+def estimate(config: TrainConfig, configs: Mapping[str, StageConfig]) -> list[str]:
+    """What data and training cost, at most: every scene as large as allowed, every pixel with all its samples."""
     lines = []
     network = config.model.build()
     scene, render = configs.get("scene"), configs.get("render")
-    side = getattr(render, "resolution", None)
-    largest = config.max_triangles or getattr(scene, "max_triangles", None)
+    side, largest = sizes(config, configs)
     if hasattr(scene, "count") and render is not None:
         images = sum(scene.count.model_dump().values()) * scene.cameras.views
         adaptive = f", fewer where the error is under {render.target_error:g}" if render.target_error else ""
@@ -296,20 +337,17 @@ def estimate(config: TrainConfig, configs: Mapping[str, StageConfig]) -> list[st
             f"(at most {render.max_spp:,} per pixel{adaptive})",
             f"visits: {visits:.1f} of each training scene",
         ]
-    if side is None or largest is None:
+    paid = cost(config, configs)
+    if paid is None:
         return [*lines, "training: cost unknown, the data does not say its resolution or its triangles"]
-    flops = forward_flops(network, [largest], config.views_per_scene, side, side)
-    step = TRAINING * sum(flops.values()) * config.batch_scenes
     rays = config.views_per_scene * (side // network.patch_size) ** 2
     tokens = (largest + network.num_register_tokens + rays) * config.batch_scenes
-    peaks = {name: value * 1e12 * UTILISATION for name, value in A100_TFLOPS.items()}
-    days = TRAINING * ideal_seconds(flops, peaks, config.precision) * config.batch_scenes * config.steps / 86400
     return [
         *lines,
         f"training: {config.steps:,} steps of {config.batch_scenes} scenes x {config.views_per_scene} views, "
         f"{tokens:,} tokens a step, {tokens * config.steps:.2e} in all",
-        f"compute: {step:.2e} FLOPs a step, {step * config.steps:.2e} in all; {days:.3g} days of one A100, {days / 8:.3g} of "
-        f"eight (at {UTILISATION:.0%} of its peak, {config.precision} precision)",
+        f"compute: {paid.flops / config.steps:.2e} FLOPs a step, {paid.flops:.2e} in all; {paid.days:.3g} days of one A100, "
+        f"{paid.days / 8:.3g} of eight (at {UTILISATION:.0%} of its peak, {config.precision} precision)",
         "start: "
         + (f"from {config.init_from}" if config.init_from else "from scratch (train.init_from=FOLDER: from another run)"),
     ]

@@ -102,6 +102,24 @@ def test_a_probe_with_one_more_value_computes_only_that(first, folder):
     assert "2 items, 1 of them already there" in run(folder, *words, "probe.values=[45,90]")
 
 
+def test_the_rows_of_a_table_share_the_data_and_end_in_it(first, folder):
+    words = ["sweep", "table1_small", "--rows", "full,world_space", "-o", f"{folder}/table", "jobs=2", f"store={folder}/store"]
+    words += [*SMALL, "train.steps=2", *TINY, "model.latent_dim=128"]
+    words += [f"hydra.run.dir={folder}/runs", f"hydra.sweep.dir={folder}/runs"]
+    for again in (False, True):
+        swept = subprocess.run([sys.executable, "-m", "stages.cli", *words], cwd=ROOT, capture_output=True, text=True)
+        assert swept.returncode == 0, swept.stdout + swept.stderr
+        assert ("running" in swept.stdout) != again
+    store = Store(folder / "store")
+    found = json.loads((folder / "table" / "table.json").read_text())
+    made = {row["name"]: store.resolve(row["evaluate"]) for row in found["rows"] if "ours" in row}
+    assert list(made) == ["full", "world_space"] and found["shard"] == store.resolve("shard").key
+    for artifact in made.values():
+        assert artifact.manifest["preimage"]["inputs"]["shard"] == found["shard"]
+    views = json.loads(made["full"].file("metrics.json").read_text())["views"]
+    assert f"{views} views" in (folder / "table" / "table.md").read_text()
+
+
 TINY = [
     "model.num_heads=1", "model.dim_feedforward=512", "model.num_layers=1", "model.view_transformer_latent_dim=128",
     "model.view_transformer_n_heads=1", "model.view_transformer_ffn_hidden_dim=512", "model.view_transformer_n_layers=4",

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from pipeline.__main__ import sweep_keys
 from pipeline.config import parse
 from pipeline.errors import UserError
 from pipeline.hydra_config import CONF, compose
@@ -43,7 +42,7 @@ def test_yaml_names_every_field_of_its_config(stage, variant):
 
 @pytest.mark.parametrize("model", sorted(path.stem for path in (CONF / "model").glob("*.yaml")))
 def test_every_model_is_a_valid_config(model):
-    parse(SYSTEM.stage("train").Config, compose([f"model={model}"])["train"], "train")
+    parse(SYSTEM.stage("train").Config, compose([f"model={model}", "train.informed_start=inputs"])["train"], "train")
 
 
 @pytest.mark.parametrize(
@@ -63,21 +62,18 @@ def test_wrong_words_name_the_right_ones(overrides, message):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "message"), [(["train.lr=-1"], r"^train\.lr=-1: "), (["+train.lrr=1"], r"^train\.lrr is unknown")]
+    ("overrides", "message"),
+    [
+        (["train.lr=-1"], r"^train\.lr=-1: "),
+        (["+train.lrr=1"], r"^train\.lrr is unknown"),
+        # before any data is made, not when the network is built
+        (["model=143m", "model.view_transformer_n_layers=3"], r"^train\.model: .*3 decoder layers: the DPT head reads four"),
+        (["model=nerf_pe"], r"^train: informed_start=true .* nerf_pe .*informed_start=inputs"),
+    ],
 )
 def test_wrong_values_are_named_as_they_are_written(overrides, message):
     with pytest.raises(UserError, match=message):
         parse(SYSTEM.stage("train").Config, compose(overrides)["train"], "train")
-
-
-def test_sweep_keys_are_known_before_it_runs(tmp_path):
-    keys = sweep_keys(["stage=train", "model=tiny,small", f"store={tmp_path}"])
-    first, second = keys.values()
-    assert list(keys) == [f"stage=train model={name} store={tmp_path}" for name in ("tiny", "small")]
-    assert first["train"] != second["train"]
-    assert {name: key for name, key in first.items() if name != "train"} == {
-        name: key for name, key in second.items() if name != "train"
-    }
 
 
 @pytest.mark.parametrize("flags", [["-m"], []])

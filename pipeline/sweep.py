@@ -1,0 +1,170 @@
+"""A sweep (``-m``): the jobs that its overrides span, all their keys before the first one starts, and jobs side by side.
+
+Hydra runs the jobs one after the other in this process. With ``jobs=N`` they run N at a time instead, each in a process of its
+own with its share of the cores, so that one that dies takes no other with it; what all jobs share is made first, with all
+cores. Either way a job whose keys are no longer those of the plan stops: Hydra composes a job only when its turn comes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+
+from pipeline.errors import UserError
+from pipeline.executor import THREAD_VARIABLES
+from pipeline.hydra_config import compose
+from pipeline.runner import Planned, make_plan, run_pipeline, split_config
+from pipeline.store import HashCache, Store
+from pipeline.worker import die_with_parent
+
+KEYS_VARIABLE = "LIGHTMILL_SWEEP_KEYS"  # JSON: a job's overrides -> its keys, for the jobs of one sweep
+JOB_VARIABLE = "LIGHTMILL_SWEEP_JOB"  # set in the processes of jobs that run side by side
+
+Plan = Mapping[str, Planned]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One combination of the overrides: its words, the composed config as plain containers, and what it would make."""
+
+    words: tuple[str, ...]
+    root: Mapping[str, Any]
+    plan: Plan
+
+    @property
+    def name(self) -> str:
+        return " ".join(self.words)
+
+
+def plan_of(root: Mapping[str, Any]) -> dict[str, Planned]:
+    run, system, sections = split_config(root)
+    return make_plan(run, system, sections, HashCache(Store(run.store).root / ".cache" / "hashes.json"))
+
+
+def keys_of(plan: Plan) -> dict[str, str]:
+    return {name: planned.key for name, planned in plan.items()}
+
+
+def is_hydras(word: str) -> bool:
+    """Whether the override is of Hydra's own settings, which belong to no job."""
+    return word.lstrip("+~").startswith(("hydra.", "hydra/"))
+
+
+def expand(overrides: Sequence[str]) -> list[Job]:
+    """The jobs of a sweep, in Hydra's order."""
+    try:
+        parsed = OverridesParser.create().parse_overrides([word for word in overrides if not is_hydras(word)])
+        batches = BasicSweeper.split_arguments(parsed, None)
+    except HydraException as error:
+        raise UserError(str(error).splitlines()[0]) from None
+    roots = [(tuple(words), compose(words)) for batch in batches for words in batch]
+    return [Job(words, root, plan_of(root)) for words, root in roots]
+
+
+def sweep_keys(overrides: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Keys of every job of a sweep, by the job's overrides."""
+    return {job.name: keys_of(job.plan) for job in expand(overrides)}
+
+
+def check_keys(task: str, root: Mapping[str, Any]) -> None:
+    """UserError if the job ``task`` is one of a sweep that planned other keys for it."""
+    expected = json.loads(os.environ.get(KEYS_VARIABLE, "{}")).get(task)
+    if expected is not None and expected != keys_of(plan_of(root)):
+        raise UserError(f"the config or a source file changed after the sweep began: job {task!r} has other keys now")
+
+
+def shared_stages(jobs: Sequence[Job]) -> dict[str, str]:
+    """Stage -> key, of the stages whose artifact is the same for all jobs."""
+    first = keys_of(jobs[0].plan)
+    return {name: key for name, key in first.items() if all(keys_of(job.plan).get(name) == key for job in jobs)}
+
+
+def describe(jobs: Sequence[Job]) -> str:
+    """One line: what the jobs share, with the key of the last shared stage, and how many artifacts the others come to."""
+    shared = shared_stages(jobs)
+    names = list(dict.fromkeys(name for job in jobs for name in job.plan))
+    own = [f"{name} {len({keys_of(job.plan).get(name) for job in jobs} - {None})}" for name in names if name not in shared]
+    text = f"sweep: {len(jobs)} jobs"
+    if shared:
+        last = list(shared)[-1]
+        text += f" share {', '.join(shared)} ({last} {shared[last][:12]})"
+    return text + (f"; artifacts of their own: {', '.join(own)}" if own else "")
+
+
+def label(job: Job, jobs: Sequence[Job]) -> str:
+    """What tells the job from the others: the values of the overrides in which they differ."""
+    return " ".join(word.partition("=")[2] for word in job.words if not all(word in other.words for other in jobs)) or job.name
+
+
+def run_side_by_side(
+    jobs: Sequence[Job], at_once: int, hydra_words: Sequence[str], command: Sequence[str], out: Callable[[str], None]
+) -> dict[str, int]:
+    """Run the jobs ``at_once`` at a time in processes of their own; returns the exit status of each by its label."""
+    todo = [job for job in jobs if not _complete(job)]
+    shared = shared_stages(jobs)
+    if todo and shared:
+        _make_shared(jobs[0], shared, command, out)
+    cores = max(1, (os.cpu_count() or 1) // at_once)
+    names = {job.name: label(job, jobs) for job in jobs}
+    width = max(len(name) for name in names.values())
+    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(cores)) | {JOB_VARIABLE: "1"}
+
+    def run(job: Job) -> int:
+        def say(text: str) -> None:
+            out(f"{names[job.name]:<{width}} | {text}")
+
+        if job not in todo:  # says so, and that it was used
+            run_pipeline(job.root, command, say)
+            return 0
+        words = list(job.words)
+        if job.root["workers"] == "auto":
+            words = [word for word in words if not word.startswith("workers=")] + [f"workers={cores}"]
+        keys = json.dumps({" ".join(words): keys_of(job.plan)})
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pipeline", *words, *hydra_words],
+            env=environment | {KEYS_VARIABLE: keys}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        assert process.stdout is not None
+        for line in process.stdout:
+            say(line.rstrip("\n"))
+        return process.wait()
+
+    pool = ThreadPoolExecutor(at_once)
+    try:
+        return dict(zip(names.values(), pool.map(run, jobs), strict=True))
+    finally:  # after Ctrl-C, which the running jobs get too, none starts any more
+        pool.shutdown(cancel_futures=True)
+
+
+def live_with_the_sweep() -> None:
+    """In the process of a job: end with the sweep that started it, but let Ctrl-C reach this process too."""
+    if os.environ.pop(JOB_VARIABLE, None):
+        die_with_parent()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _complete(job: Job) -> bool:
+    run = split_config(job.root)[0]
+    store = Store(run.store)
+    return not run.force and all(store.find(name, job.plan[name].key) is not None for name in run.stage)
+
+
+def _make_shared(job: Job, shared: Mapping[str, str], command: Sequence[str], out: Callable[[str], None]) -> None:
+    """What all jobs read, once and with all workers, instead of by one job for which the others wait."""
+    run = split_config(job.root)[0]
+    forced = [name for name in run.force if name in shared]
+    if forced:
+        raise UserError(f"force={','.join(forced)}: all jobs of the sweep share it; force it by itself, then run the sweep")
+    read = {parent for name in shared for parent in job.plan[name].stage.reads(job.plan[name].config)}
+    run_pipeline({**job.root, "stage": [name for name in shared if name not in read], "force": []}, command, out)
