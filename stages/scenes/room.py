@@ -35,8 +35,8 @@ FLOOR = 0.6, 0.57, 0.53
 WALL_COLOURS = {"right": (0.55, 0.2, 0.13), "back": FLOOR, "left": (0.16, 0.34, 0.4)}
 OBJECT_COLOUR = 0.7, 0.7, 0.7  # of files without base colours
 SPECULAR, ROUGHNESS = 0.1, 0.4  # of the object
-CAMERA = {"box": (-0.15, -1.0, 0.35)}  # from the centre, other templates: ...
-OTHER_CAMERA = -0.55, -1.0, 0.65
+CAMERAS = {"box": (-0.15, -1.0, 0.35)}  # direction from what they look at; of the other templates:
+CAMERA = -0.55, -1.0, 0.65
 CAMERA_DISTANCE = 1.85
 FILLED = 0.66  # of the picture's side, by the object
 LIGHTS = {(-0.9, -0.5, 1.0): 0.5, (0.55, -1.0, 0.9): 0.2, (-0.2, -0.1, 1.2): 0.3}  # direction from the centre -> share
@@ -92,7 +92,7 @@ def room_scene(path: Path, triangles: int | None = None, room: Room | None = Non
         mesh = trimesh.remesh.subdivide(*mesh)
         placement = _object(mesh[0], turn)  # another mean of the vertices
     camera = _camera(template, place(normalize(mesh[0]), placement))
-    plan = Plan(template, "single", True, [_wall(name) for name in walls], [placement], _lights(), [camera])
+    plan = Plan(template, "single", False, [_wall(name) for name in walls], [placement], _lights(), [camera])
     meta = {"law": "room", "source": path.name, "notes": notes}
     scene = assemble(path.stem, plan, [mesh], [{"faces_before": len(original[1])}], MaterialLaw(), meta)
     if loaded.texture is None:
@@ -219,7 +219,7 @@ def _turn_to(direction: np.ndarray) -> np.ndarray:
 def _camera(template: str, points: np.ndarray) -> Camera:
     """Looks at the middle of the object's ``points``, as far as the law lets it, and opens until the object fills its share."""
     law = laws.CameraLaw()
-    direction = np.array(CAMERA.get(template, OTHER_CAMERA))
+    direction = np.array(CAMERAS.get(template, CAMERA))
     direction /= np.linalg.norm(direction)
     look_at = np.clip((points.min(axis=0) + points.max(axis=0)) / 2, *law.look_at)
     position = look_at + CAMERA_DISTANCE * direction
