@@ -1,6 +1,6 @@
 """What other programs import: ``from lightmill import Renderer``. Everything here lives in ``stages``."""
 
-from stages.predict import LimitWarning, Renderer
+from stages.inference import LimitWarning, Renderer
 from stages.scene_files import load_scene
 from stages.scenes.orbit import orbit
 from stages.scenes.room import Room

@@ -51,7 +51,7 @@ def room(arguments: argparse.Namespace) -> Any:
 
 
 def command_predict(arguments: argparse.Namespace) -> int:
-    from stages.predict import predict
+    from stages.inference import predict
 
     for path in predict(
         arguments.scene,
@@ -76,8 +76,8 @@ def command_predict(arguments: argparse.Namespace) -> int:
 
 def command_compare(arguments: argparse.Namespace) -> int:
     from stages.compare import IMAGES, compare_images, compare_scene
+    from stages.inference import write_png
     from stages.metrics import with_lpips
-    from stages.predict import write_png
 
     first, out = Path(arguments.a), arguments.out
     metrics = with_lpips(arguments.lpips, arguments.lpips_folder)

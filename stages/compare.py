@@ -137,7 +137,7 @@ def compare_scene(
     metrics: Mapping[str, Metric] = METRICS,
 ) -> Comparison:
     """One camera of a scene or mesh file: path traced with ``spp`` samples and denoised, and predicted."""
-    from stages.predict import Renderer
+    from stages.inference import Renderer
     from stages.rendering.backend import choose
     from stages.rendering.render import render_views
 
@@ -152,7 +152,7 @@ def compare_scene(
     (traced,) = render_views(scene, len(predicted), max_spp=spp, seed=0, backend=backend, views=[view])
     names = (
         f"{path}, view {view}, path traced, {traced.meta['spp']} samples per pixel, denoised",
-        f"predicted by {renderer.folder}",
+        str(renderer.folder),
     )
     notes = [*scene.meta.get("notes", ()), *(str(warning.message) for warning in caught)]
     try:

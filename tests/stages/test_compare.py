@@ -127,7 +127,7 @@ def scalar(monkeypatch):
 
 
 def test_a_scene_is_traced_and_predicted_from_the_same_arrays(cube, checkpoint, scalar):
-    from stages.predict import Renderer
+    from stages.inference import Renderer
     from stages.rendering.render import render_views
 
     result = compare_scene(cube, checkpoint, 24, spp=3)

@@ -17,8 +17,9 @@ from model import checkpoint as files
 from model.config import ModelConfig
 from pipeline.errors import UserError
 from stages.cli import main
+from stages.inference import LimitWarning, Renderer
 from stages.limits import beyond_limits
-from stages.predict import LimitWarning, Renderer, predict_frames, predict_scene, single_lights
+from stages.predict import predict_frames, predict_scene, single_lights
 from stages.scene_files import load_scene
 from stages.scenes.orbit import centre, orbit
 from stages.scenes.room import Room
