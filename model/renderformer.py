@@ -9,7 +9,7 @@ once and ``decode`` many views, call the model for both (training), or ``render`
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
@@ -325,14 +325,24 @@ class RenderFormer(nn.Module):
                 tokens.x = tokens.x.float()
             return self.decode(tokens, camera_to_world, fov_deg, resolution)
 
-    @torch.inference_mode()
     def render(
         self, scenes: Triangles, camera_to_world: Tensor, fov_deg: Tensor, resolution: int | tuple[int, int],
         precision: str = "fp32", rays_at_once: int | None = None,
     ) -> Tensor:  # fmt: skip
-        """As ``forward``, for any number of views: scenes are encoded, and keys and values projected, once for all of them.
+        """As ``forward``, for any number of views: ``render_batches`` put together."""
+        return torch.cat(
+            list(self.render_batches(scenes, camera_to_world, fov_deg, resolution, precision, rays_at_once)), dim=1
+        )
 
-        ``rays_at_once`` ray bundles are decoded together; None: a CPU's caches like few, a GPU's processors many.
+    @torch.inference_mode()
+    def render_batches(
+        self, scenes: Triangles, camera_to_world: Tensor, fov_deg: Tensor, resolution: int | tuple[int, int],
+        precision: str = "fp32", rays_at_once: int | None = None,
+    ) -> Iterator[Tensor]:  # fmt: skip
+        """(B, v, H, W, 3) of v views at a time, in order: what a long animation needs does not grow with its length.
+
+        Scenes are encoded, and keys and values projected, once for all of them. ``rays_at_once`` ray bundles are decoded
+        together; None: a CPU's caches like few, a GPU's processors many.
         """
         device = scenes.triangles.device.type
         height, width = (resolution, resolution) if isinstance(resolution, int) else resolution
@@ -340,15 +350,14 @@ class RenderFormer(nn.Module):
         views = max(1, most // max(1, len(scenes.segments) * height * width // self.config.patch_size**2))
         with autocast(device, precision in ("mixed", "bf16")):
             tokens = self.encode(scenes)
+        if precision == "mixed":
+            tokens.x = tokens.x.float()
         with autocast(device, precision == "bf16"):
-            if precision == "mixed":
-                tokens.x = tokens.x.float()
             projected = self.view_transformer.project(tokens)
-            images = [
-                self.decode(tokens, cameras, fov, resolution, projected)
-                for cameras, fov in zip(camera_to_world.split(views, 1), fov_deg.split(views, 1), strict=True)
-            ]
-        return torch.cat(images, dim=1)
+        for cameras, fov in zip(camera_to_world.split(views, 1), fov_deg.split(views, 1), strict=True):
+            with autocast(device, precision == "bf16"):
+                batch = self.decode(tokens, cameras, fov, resolution, projected)
+            yield batch  # outside of autocast, which would otherwise stay on in the caller
 
     def layers(self) -> list[nn.Module]:
         """Every transformer layer of both stages: the units of compilation, recomputation and sharding."""

@@ -37,51 +37,76 @@ def command_trace(arguments: argparse.Namespace) -> int:
         denoise=arguments.denoise,
         seed=arguments.seed,
         view=arguments.view,
+        triangles=arguments.triangles,
+        room=room(arguments),
     ):
         print(path)
     return 0
 
 
-def checkpoint_folder(reference: str | None, store: str) -> Path:
-    """A released-format checkpoint folder as given, or that of a train artifact in the store; None: the one that ships."""
-    if reference is None:
-        from stages.predict import shipped_checkpoint
+def room(arguments: argparse.Namespace) -> Any:
+    from stages.scenes.room import Room
 
-        return shipped_checkpoint()
-    if (Path(reference) / "config.json").is_file():
-        return Path(reference)
-    if Path(reference).is_dir() and not (Path(reference) / "manifest.json").is_file():
-        raise UserError(f"{reference} is no checkpoint folder: it has no config.json (and no model.safetensors beside it)")
-    from pipeline.store import Store
-
-    artifact = Store(store).resolve(reference)
-    if artifact.stage != "train":
-        raise UserError(
-            f"{reference} is an artifact of stage {artifact.stage}: give one of stage train, or a checkpoint folder"
-        )
-    return artifact.file("checkpoint")
+    return Room(arguments.room, arguments.up)
 
 
 def command_predict(arguments: argparse.Namespace) -> int:
-    from stages.predict import predict
+    from stages.inference import predict
 
     for path in predict(
-        Path(arguments.scene),
-        checkpoint_folder(arguments.checkpoint, arguments.store),
+        arguments.scene,
+        arguments.checkpoint,
         Path(arguments.out),
         resolution=arguments.resolution,
         view=arguments.view,
         device=arguments.device,
+        frames=arguments.orbit,
+        arc_deg=arguments.arc,
+        fps=arguments.fps,
+        tonemap=arguments.tonemap,
+        exposure=arguments.exposure,
+        composite_lights=arguments.composite_lights,
+        triangles=arguments.triangles,
+        room=room(arguments),
+        store=arguments.store,
     ):
         print(path)
     return 0
 
 
 def command_compare(arguments: argparse.Namespace) -> int:
-    from stages.compare import compare, table
+    from stages.compare import IMAGES, compare_images, compare_scene
+    from stages.inference import write_png
+    from stages.metrics import with_lpips
 
-    metrics = compare(Path(arguments.a), Path(arguments.b))
-    print(json.dumps(metrics, indent=1) if arguments.json else table(metrics))
+    first, out = Path(arguments.a), arguments.out
+    metrics = with_lpips(arguments.lpips, arguments.lpips_folder)
+    if arguments.b is not None or first.suffix.lower() in IMAGES:
+        if arguments.b is None:
+            raise UserError(f"{first} is an image: give the test image as well, or one scene instead of both")
+        if arguments.checkpoint is not None:
+            raise UserError("two images are compared as they are: leave --checkpoint out, or give one scene")
+        result = compare_images(first, arguments.b, metrics)
+    else:
+        result = compare_scene(
+            first,
+            arguments.checkpoint,
+            arguments.resolution,
+            arguments.view,
+            spp=arguments.spp,
+            device=arguments.device,
+            composite_lights=arguments.composite_lights,
+            triangles=arguments.triangles,
+            room=room(arguments),
+            store=arguments.store,
+            metrics=metrics,
+        )
+        out = out or f"{first.stem}-compare.png"
+    if out is not None:
+        write_png(Path(out), result.picture())
+    print(json.dumps(result.to_json(), indent=1) if arguments.json else result.table())
+    if out is not None and not arguments.json:
+        print(f"picture: {out}")
     return 0
 
 
@@ -152,6 +177,30 @@ def view_argument(text: str) -> int | str:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor 'all'") from None
 
 
+def resolution_argument(text: str) -> int | tuple[int, int]:
+    """Pixels per side, or WIDTHxHEIGHT as (height, width)."""
+    try:
+        sides = [int(word) for word in text.split("x")]
+    except ValueError:
+        sides = []
+    if len(sides) not in (1, 2):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither pixels per side nor WIDTHxHEIGHT")
+    return sides[0] if len(sides) == 1 else (sides[1], sides[0])
+
+
+def exposure_argument(text: str) -> float | None:
+    """Factor of a number of stops; None for 'auto'."""
+    if text == "auto":
+        return None
+    try:
+        stops = float(text)
+    except ValueError:
+        stops = float("nan")
+    if not -32 <= stops <= 32:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number of stops (-32 to 32) nor 'auto'")
+    return 2.0**stops
+
+
 def build_parser() -> argparse.ArgumentParser:
     debug = argparse.ArgumentParser(add_help=False)
     debug.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -193,8 +242,26 @@ def build_parser() -> argparse.ArgumentParser:
         sub.add_argument("-o", "--out", help="folder of table.md, table.json and table.png (default: runs/TABLE)")
         sub.usage = f"{PROGRAM} {name} [TABLE] [--rows ROW,...] [-o FOLDER] [name=value ...] [--debug]"
 
-    sub = add("trace", command_trace, "path trace a scene given as released JSON or HDF5", "scene.json -o out.exr --spp 256")
-    sub.add_argument("scene", help="scene file: .json or .h5")
+    scene_help = "scene file in a released format (.json, .h5), or a mesh (.glb, .gltf, .obj, .off, .ply, .stl)"
+
+    def add_mesh_options(sub: argparse.ArgumentParser, triangles: str) -> None:
+        group = sub.add_argument_group("a mesh gets a room, lights and a camera")
+        group.add_argument("--room", choices=("floor", "wall", "corner", "box"), help="default: a corner, if triangles allow")
+        group.add_argument("--up", choices=("x", "-x", "y", "-y", "z", "-z"), metavar="AXIS",
+                           help="the file's axis that points up: x, y, z, --up=-y .. (default: z for STL, else y)")  # fmt: skip
+        group.add_argument("--triangles", type=int, metavar="N", help=f"decimate it, N triangles in all (default: {triangles})")
+
+    def add_model_options(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument(
+            "--checkpoint",
+            help="released-format folder, or a train artifact's key, name or 'train' (default: the model that ships)",
+        )
+        sub.add_argument("--composite-lights", action="store_true", help="one pass per light, summed: for many lights")
+        sub.add_argument("--device", default="auto", help="cpu, cuda or auto (default)")
+        sub.add_argument("--store", default="store", help="the store's folder (default: store)")
+
+    sub = add("trace", command_trace, "path trace a scene or mesh file", "scene.json -o out.exr --spp 256")
+    sub.add_argument("scene", help=scene_help)
     sub.add_argument("-o", "--out", required=True, help="output .exr (linear RGB float); with --view all: OUT-0.exr, OUT-1.exr")
     sub.add_argument("--resolution", type=int, default=512, help="pixels per side (default: 512)")
     sub.add_argument("--spp", type=int, default=256, help="samples per pixel (default: 256)")
@@ -202,25 +269,38 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--denoise", action=argparse.BooleanOptionalAction, default=True, help="Open Image Denoise (default: on)")
     sub.add_argument("--seed", type=int, default=0)
     sub.add_argument("--view", type=view_argument, default=0, help="camera number, or 'all' (default: 0)")
+    add_mesh_options(sub, "as it is")
 
     sub = add(
-        "predict", command_predict, "render a scene with a trained model", "scene.json --checkpoint train -o out.png"
+        "predict", command_predict, "render a scene or mesh file with a trained model, a still or an animation",
+        "chair.glb --checkpoint train -o chair.png   |   lightmill predict chair.glb -o chair.mp4 --orbit 48",
     )  # fmt: skip
-    sub.add_argument("scene", help="scene file: .json or .h5")
+    sub.add_argument("scene", help=scene_help)
     sub.add_argument(
-        "--checkpoint",
-        help="released-format folder, or a train artifact's key, name or 'train' (default: the model that ships)",
+        "-o", "--out", required=True, help="output .exr (linear), .png, or .mp4 (its frames as PNGs in a folder of that name)"
     )
-    sub.add_argument("-o", "--out", required=True, help="output .exr (linear) or .png (sRGB)")
-    sub.add_argument("--resolution", type=int, default=512, help="pixels per side, divisible by 8 (default: 512)")
+    sub.add_argument("--resolution", type=resolution_argument, metavar="N",
+                     help="pixels per side, divisible by 8, or WIDTHxHEIGHT (default: as it was trained)")  # fmt: skip
     sub.add_argument("--view", type=view_argument, default=0, help="camera number, or 'all' (default: 0)")
-    sub.add_argument("--device", default="auto", help="cpu, cuda or auto (default)")
-    sub.add_argument("--store", default="store", help="the store's folder (default: store)")
+    sub.add_argument("--orbit", type=int, metavar="FRAMES", help="so many frames around the scene, starting at --view")
+    sub.add_argument("--arc", type=float, metavar="DEGREES", help="of the orbit (default: all around, or what walls allow)")
+    sub.add_argument("--fps", type=int, default=24, help="frames per second of an .mp4 (default: 24)")
+    sub.add_argument("--tonemap", default="none", metavar="NAME",
+                     help="none (clamp, default), reinhard, filmic, aces, agx or pbr_neutral; of .png and .mp4")  # fmt: skip
+    sub.add_argument("--exposure", type=exposure_argument, default=1.0, metavar="STOPS",
+                     help="of .png and .mp4, or 'auto' (default: 0)")  # fmt: skip
+    add_model_options(sub)
+    add_mesh_options(sub, "as the checkpoint was trained")
 
-    sub = add("compare", command_compare, "the metrics between two images, A the reference", "reference.exr out.exr --json")
-    sub.add_argument("a", help="reference: .exr or .png")
-    sub.add_argument("b", help="test image of the same size")
+    sub = add(
+        "compare", command_compare, "all metrics between two images, or between a scene path traced and predicted",
+        "scene.json --checkpoint train   |   lightmill compare reference.exr out.exr --json",
+    )  # fmt: skip
+    sub.add_argument("a", metavar="SCENE | A", help=f"{scene_help}; or the reference image: .exr or .png")
+    sub.add_argument("b", nargs="?", metavar="B", help="test image of the same size")
+    sub.add_argument("-o", "--out", help="picture: both images, their difference x5, HDR-FLIP (of a scene: SCENE-compare.png)")
     sub.add_argument("--json", action="store_true", help="print JSON")
+<<<<<<< HEAD
 
     sub = add(
         "report", command_report, "runs side by side, and probes, on one HTML page (with JSON and Markdown beside it)",
@@ -232,6 +312,16 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--different-data", action="store_true", help="also runs that were evaluated on different scenes")
     sub.add_argument("--title", help="the page's title")
     sub.add_argument("--store", default="store", help="the store's folder (default: store)")
+=======
+    sub.add_argument("--lpips", choices=("none", "vgg", "alex"), default="none", help="LPIPS as well, by that network")
+    sub.add_argument("--lpips-folder", metavar="FOLDER", help="where its published weights lie")
+    group = sub.add_argument_group("of a scene")
+    group.add_argument("--resolution", type=int, metavar="N", help="pixels per side (default: as the checkpoint was trained)")
+    group.add_argument("--view", type=int, default=0, help="camera number (default: 0)")
+    group.add_argument("--spp", type=int, default=256, help="samples per pixel of the reference (default: 256)")
+    add_model_options(sub)
+    add_mesh_options(sub, "as the checkpoint was trained")
+>>>>>>> w6-predict
     for sub in parsers.choices.values():
         sub.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show the traceback of an error")
     return parser

@@ -1,11 +1,14 @@
-"""``lightmill trace``: path trace a scene given in a released format, and write float EXR pictures."""
+"""``lightmill trace``: path trace a scene or mesh file (``stages.scene_files``), and write float EXR pictures."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    from stages.scenes.room import Room
 
 
 def trace(
@@ -19,12 +22,17 @@ def trace(
     view: int | Literal["all"] = 0,
     lights_visible: bool = True,
     backend: str = "auto",
+    triangles: int | None = None,
+    room: Room | None = None,
 ) -> list[Path]:
-    """Write the view (or ``OUT-0.exr``, ``OUT-1.exr`` .. for all) as linear RGB and return the files' paths."""
+    """Write the view (or ``OUT-0.exr``, ``OUT-1.exr`` .. for all) as linear RGB and return the files' paths.
+
+    triangles, room: of a mesh, as of ``load_scene``.
+    """
     from stages.exr import write_rgb
-    from stages.released import load_scene
     from stages.rendering.backend import choose
     from stages.rendering.render import render_views
+    from stages.scene_files import load_scene
 
     out = Path(out_path)
     if out.suffix.lower() != ".exr":
@@ -33,7 +41,7 @@ def trace(
         raise UserError(f"the folder {out.parent} does not exist: make it first")
     if resolution < 1 or spp < 1 or seed < 0:
         raise UserError(f"resolution={resolution}, spp={spp}, seed={seed}: expected at least 1, 1 and 0")
-    scene = load_scene(scene_path)
+    scene = load_scene(scene_path, triangles, room)
     count = len(scene.camera_to_world)
     if view != "all" and not 0 <= view < count:
         raise UserError(f"view={view} does not exist: {scene_path} has {count} camera(s), counted from 0; or give 'all'")

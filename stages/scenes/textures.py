@@ -10,6 +10,7 @@ Colours are linear; texel [row, column] lies as ``SceneRecord.patches`` says.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -93,8 +94,24 @@ def transfer(
 ) -> np.ndarray:
     """(F, 32, 32, 3) float32 linear colours of ``triangles`` (F, 3, 3) from the nearest points of a textured mesh.
 
-    vertices (V, 3), faces (S, 3): the mesh that ``texture`` belongs to, in the frame of the triangles. ``seen``: (S,) bool,
-    the faces to take colours from (None: all).
+    The mesh as of `nearest_colours`, in the frame of the triangles.
+    """
+    look = nearest_colours(texture, vertices, faces, seen)
+    weights = texel_points(points_per_side(texture, len(triangles)))
+
+    def colours(chunk: np.ndarray) -> np.ndarray:
+        return look(np.einsum("tgk,fkc->ftgc", weights, triangles[chunk].astype(np.float64)).reshape(-1, 3))
+
+    return _means(colours, len(triangles), weights.shape)
+
+
+def nearest_colours(
+    texture: TextureRecord, vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray | None = None
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A function of (N, 3) points: (N, 3) float32 linear colours of the nearest points of a textured mesh.
+
+    vertices (V, 3), faces (S, 3): the mesh that ``texture`` belongs to. ``seen``: (S,) bool, the faces to take colours from
+    (None: all).
     """
     import igl
 
@@ -102,13 +119,11 @@ def transfer(
     vertices = np.ascontiguousarray(vertices, np.float64)
     faces = np.ascontiguousarray(faces[kept], np.int64)
     material, uv = texture.material[kept].astype(np.int64), texture.uv[kept].astype(np.float64)
-    weights = texel_points(points_per_side(texture, len(triangles)))
     corners = vertices[faces]
     tree = igl.AABB()
     tree.init(vertices, faces)
 
-    def colours(chunk: np.ndarray) -> np.ndarray:
-        points = np.einsum("tgk,fkc->ftgc", weights, triangles[chunk].astype(np.float64)).reshape(-1, 3)
+    def colours(points: np.ndarray) -> np.ndarray:
         _, face, nearest = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
         face = np.asarray(face).ravel()
         place = _barycentric(nearest, corners[face])
@@ -121,7 +136,7 @@ def transfer(
                 out[mine] *= look_up(texture.images[texture.image[row]], where[mine], tuple(texture.wrap[row]))
         return out
 
-    return _means(colours, len(triangles), weights.shape)
+    return colours
 
 
 def points_per_side(texture: TextureRecord, count: int) -> int:

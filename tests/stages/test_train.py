@@ -14,7 +14,8 @@ from fakes import FakeArtifact, sharded
 
 from pipeline.errors import UserError
 from stages.dataset import decode_sample
-from stages.predict import load_model, predict, predict_scene
+from stages.inference import predict
+from stages.predict import load_model, predict_scene
 from stages.s06_train import ModelSection, Train, TrainConfig
 
 MODEL = dict(
@@ -182,7 +183,7 @@ def test_model_section_mirrors_the_network_config():
 
 
 def test_stage_is_cheap_to_import():
-    code = "import sys, stages.s06_train, stages.predict; sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
+    code = "import sys, stages.s06_train, stages.inference; sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
@@ -201,19 +202,19 @@ def test_predict_writes_images(trained, shared_data, tmp_path, capsys):
 
 
 def test_without_a_checkpoint_the_shipped_model_is_used(trained, shared_data, tmp_path, monkeypatch, capsys):
-    import stages.predict
+    import stages.inference
     from stages.cli import main
 
     scene = next(path for path in sorted((shared_data / "scenes").rglob("*.h5")))
     words = ["predict", str(scene), "-o", str(tmp_path / "out.png"), "--resolution", "16", "--device", "cpu"]
-    monkeypatch.setattr(stages.predict, "PRETRAINED", tmp_path / "none")
+    monkeypatch.setattr(stages.inference, "PRETRAINED", tmp_path / "none")
     assert main(words) == 2 and "no model ships" in capsys.readouterr().err
-    monkeypatch.setattr(stages.predict, "PRETRAINED", trained[0].files / "checkpoint")
+    monkeypatch.setattr(stages.inference, "PRETRAINED", trained[0].files / "checkpoint")
     assert main(words) == 0 and (tmp_path / "out.png").is_file()
 
 
 def test_what_ships_is_small_and_has_its_report():
-    from stages.predict import PRETRAINED
+    from stages.inference import PRETRAINED
 
     if not (PRETRAINED / "config.json").is_file():
         pytest.skip("no model ships yet")

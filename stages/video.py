@@ -1,0 +1,47 @@
+"""Frames to an MP4 that plays anywhere: H.264 in yuv420p, by PyAV (FFmpeg's libraries)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import UserError
+
+QUALITY = "16"  # x264's constant rate factor: differences are not seen
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = 24) -> int:
+    """(H, W, 3) uint8 sRGB frames of one even size, taken one by one, as an MP4 file; returns how many there were.
+
+    The file appears whole or not at all.
+    """
+    import av
+    from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
+
+    temporary = path.with_name(path.name + ".tmp")
+    count = 0
+    try:
+        with av.open(str(temporary), "w", format="mp4", options={"movflags": "faststart"}) as file:
+            stream = file.add_stream("libx264", rate=fps, options={"crf": QUALITY, "preset": "medium"})
+            stream.pix_fmt, stream.time_base = "yuv420p", Fraction(1, fps)
+            context = stream.codec_context
+            context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.ITU709
+            context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.IEC61966_2_1  # sRGB
+            for frame in frames:
+                if count == 0:
+                    stream.height, stream.width = frame.shape[:2]
+                picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+                picture = picture.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709)
+                picture.pts = count
+                file.mux(stream.encode(picture))
+                count += 1
+            file.mux(stream.encode())
+        temporary.replace(path)
+    except (av.error.FFmpegError, OSError) as error:
+        raise UserError(f"{path} cannot be written ({error}): give a file in an existing folder") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    return count
