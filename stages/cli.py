@@ -300,7 +300,14 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("b", nargs="?", metavar="B", help="test image of the same size")
     sub.add_argument("-o", "--out", help="picture: both images, their difference x5, HDR-FLIP (of a scene: SCENE-compare.png)")
     sub.add_argument("--json", action="store_true", help="print JSON")
-<<<<<<< HEAD
+    sub.add_argument("--lpips", choices=("none", "vgg", "alex"), default="none", help="LPIPS as well, by that network")
+    sub.add_argument("--lpips-folder", metavar="FOLDER", help="where its published weights lie")
+    group = sub.add_argument_group("of a scene")
+    group.add_argument("--resolution", type=int, metavar="N", help="pixels per side (default: as the checkpoint was trained)")
+    group.add_argument("--view", type=int, default=0, help="camera number (default: 0)")
+    group.add_argument("--spp", type=int, default=256, help="samples per pixel of the reference (default: 256)")
+    add_model_options(sub)
+    add_mesh_options(sub, "as the checkpoint was trained")
 
     sub = add(
         "report", command_report, "runs side by side, and probes, on one HTML page (with JSON and Markdown beside it)",
@@ -312,16 +319,6 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--different-data", action="store_true", help="also runs that were evaluated on different scenes")
     sub.add_argument("--title", help="the page's title")
     sub.add_argument("--store", default="store", help="the store's folder (default: store)")
-=======
-    sub.add_argument("--lpips", choices=("none", "vgg", "alex"), default="none", help="LPIPS as well, by that network")
-    sub.add_argument("--lpips-folder", metavar="FOLDER", help="where its published weights lie")
-    group = sub.add_argument_group("of a scene")
-    group.add_argument("--resolution", type=int, metavar="N", help="pixels per side (default: as the checkpoint was trained)")
-    group.add_argument("--view", type=int, default=0, help="camera number (default: 0)")
-    group.add_argument("--spp", type=int, default=256, help="samples per pixel of the reference (default: 256)")
-    add_model_options(sub)
-    add_mesh_options(sub, "as the checkpoint was trained")
->>>>>>> w6-predict
     for sub in parsers.choices.values():
         sub.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show the traceback of an error")
     return parser
