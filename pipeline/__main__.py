@@ -58,7 +58,8 @@ def interruptible() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        if signal.getsignal(signal.SIGINT) is in_order:  # else the process is about to end: a late second one finds it so
+            signal.signal(signal.SIGINT, before)
 
 
 def guarded(work: Callable[[], None], debug: bool = False) -> int:

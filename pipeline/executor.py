@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +122,7 @@ def open_pool(workers: int, threads: int) -> Iterator[ProcessPool]:
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
     """Threads and processes that begin in here never see Ctrl-C, not even while they import: it is the runner's business."""
+    resource_tracker.ensure_running()  # its first start would let Ctrl-C through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

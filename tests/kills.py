@@ -28,6 +28,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -46,10 +47,10 @@ TRAIN = (
     "model.view_transformer_n_layers=4",
 )  # fmt: skip
 MEASURED = ("seconds", "scenes_per_s", "tokens_per_s", "memory_gb", "mfu")  # of a log row; all else must be equal
-MOMENTS = {  # pattern of what appears -> at most so many of them are waited for
-    "{stage}/*.partial": 1, "{stage}/*.partial/markers/[!.]*.json": 4, "{stage}/*.partial/parts/*.tar": 4,
-    "{stage}/*.partial/items.jsonl": 1, "{stage}/*.partial/manifest.json": 1, "{stage}/*-*/manifest.json": 1,
-}  # fmt: skip
+# Pattern of what appears -> at most so many of them are waited for.
+COMMIT = {"{stage}/*.partial/items.jsonl": 1, "{stage}/*.partial/manifest.json": 1, "{stage}/*-*/manifest.json": 1}
+PARTS = {"{stage}/*.partial": 1, "{stage}/*.partial/markers/[!.]*.json": 4, "{stage}/*.partial/parts/*.tar": 4, **COMMIT}
+CHECKPOINTS = {"{stage}/*.partial/state/*": 1, "{stage}/*.partial/state/.*": 1, "{stage}/*.partial/files/*": 2, **COMMIT}
 KILLS_PER_ROUND = 6
 PATIENCE_S = 3600.0  # no run here takes so long, even on a busy machine: one that does hangs
 
@@ -61,6 +62,7 @@ class Campaign:
     command: Callable[[Path], list[str]]
     stages: tuple[str, ...]  # made anew in each round; others are taken from the undisturbed run
     begun: str = " running "  # in the output: from here on there is something to lose
+    moments: dict[str, int] = field(default_factory=lambda: PARTS)
 
 
 def meshes(folder: Path) -> Path:
@@ -74,13 +76,13 @@ def meshes(folder: Path) -> Path:
     return folder
 
 
-def line(stage: str, overrides: Sequence[str], stages: tuple[str, ...], begun: str = " running ") -> Campaign:
+def line(stage: str, overrides: Sequence[str], stages: tuple[str, ...], **more: Any) -> Campaign:
     def command(store: Path) -> list[str]:
         source = ["collect=folder", f"collect.path={meshes(store.parent / 'meshes')}"]
         where = [f"store={store}", f"hydra.run.dir={store}/.runs"]
         return [sys.executable, "-m", "pipeline", f"stage={stage}", *where, *source, *overrides]
 
-    return Campaign(command, stages, begun)
+    return Campaign(command, stages, **more)
 
 
 def synthetic(store: Path) -> list[str]:
@@ -93,7 +95,7 @@ def synthetic(store: Path) -> list[str]:
 CAMPAIGNS = {
     "synthetic": Campaign(synthetic, ("numbers", "squares", "total")),
     "data": line("shard", DATA, ("collect", "remesh", "decimate", "scene", "render", "shard")),
-    "train": line("train", (*DATA, *TRAIN), ("train",), "parameters ("),
+    "train": line("train", (*DATA, *TRAIN), ("train",), begun="parameters (", moments=CHECKPOINTS),
 }
 
 
@@ -280,11 +282,12 @@ class Striker:
             stage = self.random.choice(
                 [name for name in self.campaign.stages if not list(run.store.glob(f"{name}/*-*"))] or ["*"]
             )
-            pattern = self.random.choice(list(MOMENTS))
-            number, jitter = self.random.randint(1, MOMENTS[pattern]), self.random.uniform(0, 0.004)
+            moments = self.campaign.moments
+            pattern = self.random.choice(list(moments))
+            number, jitter = self.random.randint(1, moments[pattern]), self.random.uniform(0, 0.004)
             moment = pattern.format(stage=stage)
             seen = len(list(run.store.glob(moment)))
-            if seen >= MOMENTS[pattern] == 1:  # left by an earlier kill: it will be there at once
+            if seen and "*" not in pattern.rpartition("/")[2]:  # left by an earlier kill: it will be there at once
                 seen = 0
             arrived = run.wait_until(lambda: len(list(run.store.glob(moment))) >= seen + number, 0.0005)
             time.sleep(jitter)

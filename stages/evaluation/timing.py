@@ -56,7 +56,7 @@ def _run(model: RenderFormer, sample: Sample, device: str) -> dict[str, float]:
 
     from stages.dataset import collate, make_example
 
-    batch = collate([make_example(sample, list(sample.views)[:1], None)])
+    batch = collate([make_example(sample, list(sample.views)[:1], None)], 1)
     scene = model.read(batch, device)
     cameras, fov = (torch.from_numpy(batch[name]).to(device) for name in ("camera_to_world", "fov_deg"))
     resolution = batch["image"].shape[2:4]

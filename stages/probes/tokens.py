@@ -180,7 +180,7 @@ def tokens_of(model: Any, scene: SceneRecord, device: str) -> list[tuple[torch.T
 
     entering: list[torch.Tensor] = []
     hook = model.transformer.register_forward_pre_hook(lambda layer, inputs: entering.append(inputs[0]))
-    batch = collate([make_example(Sample(scene, {}), np.zeros(0, np.int64), None)])
+    batch = collate([make_example(Sample(scene, {}), np.zeros(0, np.int64), None)], 1)
     try:
         with torch.no_grad():
             leaving = model.encode(model.read(batch, device)).x
