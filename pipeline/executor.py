@@ -160,6 +160,8 @@ def run_on(
         if not flying:
             return
         done, _ = wait(list(flying), timeout=POLL_S, return_when=FIRST_COMPLETED)
+        if not done and not pool.active:  # its threads gave up over a worker killed as it started: nobody will answer
+            raise PoolBroken(flying.values())
         for future in done:
             task = flying.pop(future)
             try:
