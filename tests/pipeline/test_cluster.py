@@ -124,7 +124,12 @@ def test_own_cluster(tmp_path):
 def test_a_job_queue_starts_the_workers_and_ends_them(tmp_path, monkeypatch):
     """dask_jobqueue's own class, with an ``sbatch`` that runs the job script here at once."""
     for name, script in (
-        ("sbatch", f'setsid bash "$1" > {tmp_path}/job.log 2>&1 & echo $! > {tmp_path}/job; echo "Submitted batch job $!"'),
+        # a queue keeps a copy of the script, which may be gone when the job starts
+        (
+            "sbatch",
+            f'cp "$1" {tmp_path}/job.sh; setsid bash {tmp_path}/job.sh > {tmp_path}/job.log 2>&1 & '
+            f'echo $! > {tmp_path}/job; echo "Submitted batch job $!"',
+        ),
         ("scancel", f'echo "$1" > {tmp_path}/cancelled; kill -- "-$1"'),
     ):
         path = tmp_path / "bin" / name
