@@ -6,6 +6,7 @@ happened. tests/kills.py does the same hundreds of times.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -56,7 +57,15 @@ def wait_for(ready, process: subprocess.Popen) -> None:
 
 def at_work(store: Path, item: str):
     """Whether a worker has announced the item."""
-    return lambda: any(f'"{item}"' in path.read_text() for path in store.glob("*/*.partial/running/*.json"))
+
+    def seen() -> bool:
+        for path in store.glob("*/*.partial/running/*.json"):
+            with contextlib.suppress(FileNotFoundError):  # the part was finished meanwhile
+                if f'"{item}"' in path.read_text():
+                    return True
+        return False
+
+    return seen
 
 
 def digests(store: Path) -> dict[str, str]:
