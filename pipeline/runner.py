@@ -404,12 +404,12 @@ def _run_map(
         part_item_keys = tuple(keys[index] for index in indices)
         part_key = digest_of({"group": group, "items": part_item_keys})
         parts[part_key] = group, tuple(items[index] for index in indices), part_item_keys
-    markers, damaged = draft.sound_markers(parts)
+    markers, damaged = draft.sound_markers({key: [item.id for item in part_items] for key, (_, part_items, _) in parts.items()})
     tasks: list[PartTask] = []
     total, reused = len(items), 0
     for part_key, (group, part_items, part_item_keys) in parts.items():
         marker = markers[part_key]
-        if marker is not None and marker["items"] == [item.id for item in part_items]:
+        if marker is not None:
             reused += len(part_items)
             state.add_rejects(Counter(reject["reason"] for reject in marker["rejects"]))
             continue

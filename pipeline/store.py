@@ -364,14 +364,17 @@ class Draft(_Records):
         except (OSError, ValueError):
             return None
 
-    def sound_markers(self, part_keys: Collection[str]) -> tuple[dict[str, dict[str, Any] | None], int]:
-        """Part key -> marker (less its rows) or None, with every byte read; and how many parts turned out damaged.
+    def sound_markers(self, parts: Mapping[str, list[str]]) -> tuple[dict[str, dict[str, Any] | None], int]:
+        """Of ``parts``, part key -> ids of its items: part key -> marker (less its rows) or None, with every byte read; and how
+        many parts turned out damaged. A marker of other items does not count.
 
         What an interrupted run left may have lain for weeks; hashing runs at the disk's speed, computing again does not.
         """
 
         def check(part_key: str) -> tuple[dict[str, Any] | None, bool]:
             marker = self.marker(part_key)
+            if marker is not None and marker["items"] != parts[part_key]:
+                return None, False
             if marker is not None:
                 del marker["rows"]  # there may be millions
             if marker is None or marker["digest"] is None or hash_file(self.part_path(marker["digest"])) == marker["digest"]:
@@ -379,7 +382,7 @@ class Draft(_Records):
             return None, True
 
         with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as threads:
-            found = dict(zip(part_keys, threads.map(check, part_keys), strict=True))
+            found = dict(zip(parts, threads.map(check, parts), strict=True))
         return {key: marker for key, (marker, _) in found.items()}, sum(damaged for _, damaged in found.values())
 
     def finish_part(self, part_key: str, marker: Mapping[str, Any]) -> None:

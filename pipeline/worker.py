@@ -206,11 +206,10 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
         return result
 
     say(f"{len(task.items)} items of {task.stage} {task.group or '-'}: process {os.getpid()} on {socket.gethostname()}")
-    if draft.marker(task.part_key) is not None:
-        finished = draft.sound_markers([task.part_key])[0][task.part_key]
-        if finished is not None:
-            say("finished already, by a worker that died before it could say so")
-            return PartResult(task.part_key, len(task.items), Counter(reject["reason"] for reject in finished["rejects"]))
+    finished = draft.sound_markers({task.part_key: [item.id for item in task.items]})[0][task.part_key]
+    if finished is not None:
+        say("finished already, by a worker that died before it could say so")
+        return PartResult(task.part_key, len(task.items), Counter(reject["reason"] for reject in finished["rejects"]))
     writer = draft.open_part()
     rejects: list[dict[str, Any]] = []
     failed: list[tuple[str, str]] = []

@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.errors import UserError
 from stages.metrics import METRICS, Metric, flip_map, measure_all
-from stages.tonemap import exposure_for, from_picture, srgb_encode, to_picture
+from stages.tonemap import exposure_for, exposure_text, from_picture, srgb_encode, to_picture
 
 if TYPE_CHECKING:
     from stages.scenes.room import Room
@@ -73,13 +73,13 @@ class Comparison:
         from PIL import Image, ImageDraw, ImageFont
 
         exposure = exposure_for(self.reference)
-        difference = np.abs(srgb_encode(self.test * exposure) - srgb_encode(self.reference * exposure)) * DIFFERENCE_GAIN
-        stated = "" if exposure == 1 else f", exposure {exposure:g}" if exposure > 1 else f", exposure 1/{1 / exposure:g}"
+        difference, flip = error_pictures(self.reference, self.test, exposure)
+        stated = "" if exposure == 1 else f", {exposure_text(exposure)}"
         panels = {
             f"{self.labels[0]}{stated}": to_picture(self.reference, exposure),
             f"{self.labels[1]}{stated}": to_picture(self.test, exposure),
-            f"difference x{DIFFERENCE_GAIN}": np.round(np.clip(difference, 0, 1) * 255).astype(np.uint8),
-            "HDR-FLIP error": magma(flip_map(self.reference, self.test)),
+            f"difference x{DIFFERENCE_GAIN}": difference,
+            "HDR-FLIP error": flip,
         }
         times = max(1, -(-PANEL // self.reference.shape[1]))
         height, width = (times * side for side in self.reference.shape[:2])
@@ -100,11 +100,14 @@ class Comparison:
         return np.asarray(page)
 
 
-def magma(values: np.ndarray) -> np.ndarray:
-    """(H, W) values in [0, 1] as (H, W, 3) uint8 in FLIP's colour map."""
+def error_pictures(reference: np.ndarray, test: np.ndarray, exposure: float) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 3) uint8: the difference of the two as pictures of that exposure, times `DIFFERENCE_GAIN`, and the HDR-FLIP map
+    of the linear images in its own colours."""
     import matplotlib
 
-    return np.ascontiguousarray(matplotlib.colormaps["magma"](np.clip(values, 0, 1), bytes=True)[..., :3])
+    difference = np.abs(srgb_encode(test * exposure) - srgb_encode(reference * exposure)) * DIFFERENCE_GAIN
+    flip = matplotlib.colormaps["magma"](np.clip(flip_map(reference, test), 0, 1), bytes=True)[..., :3]
+    return np.round(np.clip(difference, 0, 1) * 255).astype(np.uint8), np.ascontiguousarray(flip)
 
 
 def compare_images(a: Path | str, b: Path | str, metrics: Mapping[str, Metric] = METRICS) -> Comparison:

@@ -60,6 +60,11 @@ def exposure_for(radiance: np.ndarray) -> float:
     return float(2.0 ** round(np.log2(0.7 / bright))) if bright > 1e-6 else 1.0
 
 
+def exposure_text(exposure: float) -> str:
+    """In words, as in ``exposure 1/4``."""
+    return f"exposure {exposure:g}" if exposure >= 1 else f"exposure 1/{1 / exposure:g}"
+
+
 def to_picture(radiance: np.ndarray, exposure: float = 1.0, mapper: str = "none") -> np.ndarray:
     """(..., 3) linear radiance as (..., 3) uint8 sRGB; ``mapper`` is a key of `TONE_MAPPERS`."""
     return np.round(srgb_encode(TONE_MAPPERS[mapper](radiance * exposure)) * 255).astype(np.uint8)

@@ -17,14 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from stages.compare import DIFFERENCE_GAIN, error_pictures
 from stages.evaluation import plots, tables
 from stages.evaluation.runs import Images, Probe, Run
 from stages.evaluation.statistics import BREAKDOWNS, worst_first
 from stages.evaluation.timing import PER_IMAGE, STEPS
-from stages.metrics import flip_map
-from stages.tonemap import exposure_for, srgb_encode, to_picture
+from stages.tonemap import exposure_for, to_picture
 
-DIFFERENCE_GAIN = 5
 OVERVIEW_VIEWS = 10  # columns of overview.png
 OVERVIEW_VIEW_PIXELS = 128  # least width of a column
 TITLES = ("Probes of a model", "How close the model comes to the path tracer", "Models side by side")  # by number of runs
@@ -47,8 +46,6 @@ def png(pixels: np.ndarray) -> bytes:
 
 def view_pictures(runs: Sequence[Images]) -> tuple[list[tuple[str, str]], list[list[tuple[str, str]]], float]:
     """Pictures of one view as [(caption, data URI)]: those that all runs share, those of each run; and the exposure."""
-    import matplotlib
-
     target = runs[0]["target"]
     exposure = exposure_for(target)
 
@@ -56,12 +53,11 @@ def view_pictures(runs: Sequence[Images]) -> tuple[list[tuple[str, str]], list[l
         return picture_uri(png(np.ascontiguousarray(pixels)))
 
     def own(prediction: np.ndarray) -> list[tuple[str, str]]:
-        difference = np.abs(srgb_encode(prediction * exposure) - srgb_encode(target * exposure)) * DIFFERENCE_GAIN
-        error = matplotlib.colormaps["magma"](np.clip(flip_map(target, prediction), 0, 1), bytes=True)[..., :3]
+        difference, flip = error_pictures(target, prediction, exposure)
         return [
             ("prediction", uri(to_picture(prediction, exposure))),
-            (f"difference ×{DIFFERENCE_GAIN}", uri(np.round(np.clip(difference, 0, 1) * 255).astype(np.uint8))),
-            ("HDR-FLIP error", uri(error)),
+            (f"difference ×{DIFFERENCE_GAIN}", uri(difference)),
+            ("HDR-FLIP error", uri(flip)),
         ]
 
     shared = [

@@ -47,6 +47,7 @@ class Judge:
 
 
 def denoised_error(a: ViewRecord, b: ViewRecord, whole: ViewRecord, quality: str) -> float:
+    """Of the image with all lights on as that network makes it, from the views of both halves and of all samples."""
     first, second, now = (
         log_encode(denoise(v.image, v.albedo, v.normal, v.coverage, quality).astype(np.float64)) for v in (a, b, whole)
     )

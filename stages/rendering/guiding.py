@@ -92,13 +92,12 @@ class Guide(Unguided):
         self.scale = [dr.opaque(mi.Float, float(GRID / max(x, 1e-9))) for x in high - low]
         cells = len(scene.camera_to_world) * CELLS
         self.light = dr.zeros(mi.UInt64, cells * BINS)  # in UNITs
-        self._shares = np.zeros((cells, BINS), np.float32)
+        self._tables = np.zeros((2, cells, BINS), np.float32)  # of each bin in its cell: share, and sum of shares up to it
         self._publish()
 
     def _publish(self) -> None:
-        self.shares = gatherable(self._shares)
-        self.cumulative = gatherable(np.cumsum(self._shares, axis=1, dtype=np.float64))
-        self.known = gatherable(np.where(self._shares.any(axis=1), SHARE, 0))
+        self.shares, self.cumulative = (gatherable(table) for table in self._tables)
+        self.known = gatherable(np.where(self._tables[1, :, -1] > 0, SHARE, 0))
 
     def learn(self, views):
         light = self.light.numpy().reshape(-1, CELLS, HEIGHTS, TURNS)
@@ -108,7 +107,9 @@ class Guide(Unguided):
             beside = np.roll(mine, 1, axis=-1) + np.roll(mine, -1, axis=-1)
             mine = (mine + SPREAD * (around[:, 2:] + around[:, :-2] + beside)).reshape(CELLS, BINS)
             total = mine.sum(axis=1, keepdims=True)
-            self._shares[view * CELLS : (view + 1) * CELLS] = mine / np.where(total > 0, total, 1)
+            shares = mine / np.where(total > 0, total, 1)
+            cells = slice(view * CELLS, (view + 1) * CELLS)
+            self._tables[:, cells] = shares, np.cumsum(shares.astype(np.float32), axis=1, dtype=np.float64)
         self._publish()
 
     def at(self, view, si, lobes, active):

@@ -60,7 +60,8 @@ def render_views(
     if mode not in MODES:
         raise UserError(f"mode={mode!r} is unknown: choose from {', '.join(MODES)}")
     backends.activate(backend, threads)
-    renderer = _renderer(scene, resolution, seed, backend, mode, max_depth, lights_visible, target_error > 0)
+    guided = target_error > 0 and max_spp > FIRST_SPP  # else there is no second portion to guide
+    renderer = _renderer(scene, resolution, seed, backend, mode, max_depth, lights_visible, guided)
     records = {}
     active = list(range(len(scene.camera_to_world))) if views is None else list(views)
     order, taken = list(active), 0

@@ -27,7 +27,7 @@ from pipeline.stage import Record
 from stages.arrays import unpack_json
 from stages.exr import decode_lights, decode_view, view_members
 from stages.records import ViewRecord
-from stages.tonemap import exposure_for, to_picture
+from stages.tonemap import exposure_for, exposure_text, to_picture
 
 SCENES = 8  # of each template and variant
 COLUMNS = 8  # pictures in a row; also the views of a scene, and the lights of a view, that are shown at most
@@ -85,7 +85,7 @@ def layer_sheet(template: str, kinds: Kinds, read: Read) -> Image.Image:
         exposure = exposure_for(view.image)
         meta = view.meta
         error = "" if meta["error"] is None else f", estimated error {meta['error']:.4f}"
-        note = f"{id}, view {meta['index']}, {meta['spp']} samples per pixel{error}, {_exposure(exposure)}"
+        note = f"{id}, view {meta['index']}, {meta['spp']} samples per pixel{error}, {exposure_text(exposure)}"
         page.heading(f"{template}_{variant}", note)
         for block in _layer_blocks(view, exposure):
             page.place(block)
@@ -111,7 +111,7 @@ def _scene_block(id: str, read: Read) -> Image.Image:
     width = sum(tile.width for tile in tiles) + GAP * (len(tiles) - 1)
     block = Image.new("RGB", (width, LINE + tiles[0].height), "white")
     more = f" ({len(views) - COLUMNS} more views)" if len(views) > COLUMNS else ""
-    _write(block, (0, 0), f"{id}, {lights} light{'s' * (lights != 1)}, {_exposure(exposure)}{more}", width)
+    _write(block, (0, 0), f"{id}, {lights} light{'s' * (lights != 1)}, {exposure_text(exposure)}{more}", width)
     for index, tile in enumerate(tiles):
         block.paste(tile, (index * (CELL + GAP), LINE))
     return block
@@ -180,10 +180,6 @@ def _image(id: str, index: int, read: Read) -> np.ndarray:
 def _view(id: str, index: int, read: Read) -> ViewRecord:
     names = view_members(index)
     return decode_view(read(id, names).members, index, f"{names[0]} of {id}")
-
-
-def _exposure(exposure: float) -> str:
-    return f"exposure {exposure:g}" if exposure >= 1 else f"exposure 1/{1 / exposure:g}"
 
 
 def _grey(values: np.ndarray) -> np.ndarray:
