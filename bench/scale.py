@@ -13,7 +13,7 @@ workers  remesh and render on one and on two workers of one thread each, beside 
 model    time, storage and cost of 2M scenes x 4 views, from what items took and weighed in the artifacts of ``--store``,
          or in a sample made for it (the paper's settings at 256 px on made-up objects). What is assumed is an option.
 
-Some 15 minutes on two quiet cores, half of it the sample of *model*.
+Some 20 minutes on two quiet cores.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ import time
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,6 +44,7 @@ from pipeline.config import StageConfig, count, parse  # noqa: E402
 from pipeline.hydra_config import compose  # noqa: E402
 from pipeline.stage import Item, MapStage, Record, System, load_system  # noqa: E402
 from pipeline.store import Artifact, Store  # noqa: E402
+from pipeline.worker import log_file  # noqa: E402
 
 LEFT = 10  # parts of the second artifact that are not there yet
 PARTS = ("store", "workers", "model")
@@ -172,9 +173,17 @@ def loop_ratio(rounds: int = 3, n: int = 30_000_000) -> float:
     return statistics.median(2 * seconds(1) / seconds(2) for _ in range(rounds))
 
 
-def timed_stage(root: dict[str, Any], stage: str, workers: int) -> tuple[float, list[tuple[str, float]]]:
-    """Compute the stage anew. Seconds of the whole, and (part, seconds since the workers were asked for) as parts came in."""
-    arrived: list[tuple[str, float]] = []
+class Arrival(NamedTuple):
+    """A finished part: its key, the process that made it, seconds since the workers were asked for."""
+
+    part: str
+    worker: str
+    at: float
+
+
+def timed_stage(root: dict[str, Any], stage: str, workers: int) -> tuple[float, list[Arrival]]:
+    """Compute the stage anew. Seconds of the whole, and its parts as they came in."""
+    arrived: list[Arrival] = []
     run_parts = runner.run_parts
 
     def noting(tasks: Any, workers: int, threads: int, limits: Any, on_result: Any, log: Any) -> None:
@@ -182,7 +191,8 @@ def timed_stage(root: dict[str, Any], stage: str, workers: int) -> tuple[float, 
         began = time.perf_counter()
 
         def note(result: Any) -> None:
-            arrived.append((result.part_key, time.perf_counter() - began))
+            at, log = time.perf_counter() - began, log_file(tasks[0].draft, result.part_key)
+            arrived.append(Arrival(result.part_key, STARTED.search(log.read_text())[2], at))
             on_result(result)
 
         run_parts(tasks, workers, threads, limits, note, log)
@@ -198,15 +208,27 @@ def timed_stage(root: dict[str, Any], stage: str, workers: int) -> tuple[float, 
         return time.perf_counter() - began, arrived
 
 
-def steady_ratio(alone: Sequence[tuple[str, float]], together: Sequence[tuple[str, float]], workers: int = 2) -> float:
-    """Work per second with ``workers`` over work per second with one, between each worker's first part and its last.
+def worked(arrivals: Sequence[Arrival]) -> Iterator[tuple[str, str, float, float]]:
+    """(part, worker, from, to) of every part but each worker's first, whose beginning nobody saw."""
+    last: dict[str, float] = {}
+    for part, worker, at in arrivals:
+        if worker in last:
+            yield part, worker, last[worker], at
+        last[worker] = at
 
-    A part's work is the time from its predecessor's arrival to its own when one worker made all.
+
+def steady_ratio(alone: Sequence[Arrival], together: Sequence[Arrival]) -> float:
+    """Work per second with many workers over work per second with one, while all of the many were at work.
+
+    A part's work is the seconds that it took one worker; of a part that was partly made then, that share of it counts.
     """
-    work = {part: after - before for (_, before), (part, after) in zip(alone, alone[1:], strict=False)}
-    window = together[workers - 1 : len(together) - workers + 1]
-    done = sum(work.get(part, 0.0) for part, _ in window[1:])
-    return done / (window[-1][1] - window[0][1])
+    work = {part: to - begun for part, _, begun, to in worked(alone)}
+    spans = list(worked(together))
+    workers = {worker for _, worker, _, _ in spans}
+    first = max(min(begun for _, worker, begun, _ in spans if worker == mine) for mine in workers)
+    last = min(max(to for _, worker, _, to in spans if worker == mine) for mine in workers)
+    done = sum(work[part] * max(0.0, min(to, last) - max(begun, first)) / (to - begun) for part, _, begun, to in spans)
+    return done / (last - first)
 
 
 def bench_workers(work: Path, objects: int, scenes: int) -> None:
@@ -331,8 +353,8 @@ def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
     add("--only", type=lambda text: text.split(","), default=list(PARTS), help=f"of {','.join(PARTS)}")
     add("--work", type=Path, help="where stores are made, and kept (default: a temporary folder)")
     add("--items", type=int, default=1_000_000, help="store: items")
-    add("--per-family", type=int, default=2, help="workers: objects of each of 21 families to remesh")
-    add("--worker-scenes", type=int, default=40, help="workers: scenes to render")
+    add("--per-family", type=int, default=4, help="workers: objects of each of 21 families to remesh")
+    add("--worker-scenes", type=int, default=80, help="workers: scenes to render")
     add("--store", help="model: take figures from the artifacts of this store")
     add("--sample-scenes", type=int, default=4, help="model: training scenes of the sample")
     add("--objects", type=int, default=800_000, help="model: objects (Objaverse 1.0 has about so many)")

@@ -26,6 +26,7 @@ from pipeline.sweep import (
     check_keys,
     describe,
     expand,
+    for_hydra,
     is_hydras,
     keys_of,
     live_with_the_sweep,
@@ -115,6 +116,7 @@ def main(words: Sequence[str] | None = None) -> int:
                     statuses = run_side_by_side(jobs, run.jobs, [*filter(is_hydras, overrides)], command, say)
                     failures.extend(report(statuses))
                     return
+                overrides[:] = for_hydra(overrides)
                 os.environ[KEYS_VARIABLE] = json.dumps({job.name: keys_of(job.plan) for job in jobs})
             else:
                 split_config(compose(overrides))  # a bad override gets our message instead of Hydra's

@@ -75,7 +75,7 @@ def _explain(message: str, overrides: Sequence[str]) -> str:
                 f"{bare} is unknown{nearest(bare, names) if '.' in bare else nearest(bare, [n for n in names if '.' not in n])}"
             )
         if (CONF / bare).is_dir():
-            choices = sorted(path.stem for path in (CONF / bare).glob("*.yaml"))
+            choices = sorted(path.relative_to(CONF / bare).with_suffix("").as_posix() for path in (CONF / bare).rglob("*.yaml"))
             value = word.partition("=")[2]
             if value not in choices and "," not in value:
                 return f"{bare}={value} is unknown{nearest(value, choices)}"

@@ -1,7 +1,7 @@
 """Where every record of an artifact lies: the rows of ``items.jsonl``, read when they are asked for.
 
 A dataset may have millions of records and every process that reads some of them needs to find them: a listing keeps where the
-lines of its file begin (about 150 bytes a record), not the parsed rows (about 1,500).
+lines of its file begin and what the records' digests are (about 190 bytes a record), not the parsed rows (about 1,500).
 """
 
 from __future__ import annotations
@@ -12,18 +12,16 @@ import re
 import sys
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO, overload
+from typing import Any, BinaryIO, NamedTuple, overload
 
 # a line's beginning, as ``json_line`` writes a row: keys are sorted, and an id has nothing to escape
-_DIGEST = b'{"digest": "'
-_ID = re.compile(rb'\{"digest": "[0-9a-f]{64}", "group": "(?:[^"\\]|\\.)*", "id": "([A-Za-z0-9_-]+)", ')
+_BEGINNING = re.compile(rb'\{"digest": "([0-9a-f]{64})", "group": "(?:[^"\\]|\\.)*", "id": "([A-Za-z0-9_-]+)", ')
+_DIGEST_BYTES = 32
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(NamedTuple):
     """Where one record lies: ``members`` maps a member's name to (offset, bytes) in the part's tar."""
 
     id: str
@@ -35,7 +33,7 @@ class Row:
     members: Mapping[str, tuple[int, int]]
 
     def to_json(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__slots__}
+        return self._asdict()
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Row:
@@ -55,17 +53,19 @@ class Listing(Sequence[Row]):
         return open(self._path, "rb")  # noqa: SIM115 - for single lines, as long as the listing lives
 
     @cached_property
-    def _lines(self) -> tuple[array, dict[str, int]]:
-        """Where each line begins and the last ends, and the number of each record's line."""
-        starts, numbers = array("Q", [0]), {}
+    def _lines(self) -> tuple[array, dict[str, int], bytearray]:
+        """Where each line begins and the last ends, the number of each record's line, and the records' digests in a row."""
+        starts, numbers, digests = array("Q", [0]), {}, bytearray()
         with open(self._path, "rb") as file:
             for number, text in enumerate(file):
-                match = _ID.match(text)
+                match = _BEGINNING.match(text)
                 if match is None:
                     raise ValueError(f"{self._path}: line {number + 1} is no row")
                 starts.append(starts[-1] + len(text))
-                numbers[match[1].decode()] = number
-        return starts, numbers
+                digest, record_id = match.groups()
+                numbers[record_id.decode()] = number
+                digests += bytes.fromhex(digest.decode())
+        return starts, numbers, digests
 
     def __len__(self) -> int:
         return len(self._lines[0]) - 1
@@ -73,7 +73,7 @@ class Listing(Sequence[Row]):
     def __iter__(self) -> Iterator[Row]:
         with open(self._path, "rb") as file:
             for text in file:
-                yield Row.from_json(json.loads(text))
+                yield Row.from_json(json.loads(text.decode()))  # of bytes, json guesses the encoding anew each time
 
     @overload
     def __getitem__(self, index: int) -> Row: ...
@@ -90,9 +90,9 @@ class Listing(Sequence[Row]):
         return record_id in self._lines[1]
 
     def digest(self, record_id: str) -> str:
-        """The record's digest, which its line begins with; KeyError if there is none."""
-        start = self._lines[0][self._lines[1][record_id]]
-        return os.pread(self._file.fileno(), len(_DIGEST) + 64, start)[len(_DIGEST) :].decode()
+        """The record's digest, without reading its row; KeyError if there is none."""
+        start = self._lines[1][record_id] * _DIGEST_BYTES
+        return self._lines[2][start : start + _DIGEST_BYTES].hex()
 
     def find(self, record_id: str) -> Row:
         """The record's row; KeyError if there is none."""

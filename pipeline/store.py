@@ -430,6 +430,7 @@ class Draft(_Records):
 
         write_atomic(self.path / "items.jsonl", lines())
         self._rows = Listing(self.path / "items.jsonl")
+        self._records = len(makers)
 
     def rows(self) -> Listing:
         return self._rows
@@ -465,7 +466,7 @@ class Draft(_Records):
         )
         return {
             "digest": digest,
-            "records": len(self._rows),
+            "records": self._records,
             "items": sum(len(marker["items"]) for marker in self._markers),
             "rejects": reasons,
             "bytes": sum(part["bytes"] for part in parts) + sum(entry["bytes"] for entry in files.values()),

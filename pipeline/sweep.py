@@ -72,6 +72,28 @@ def expand(overrides: Sequence[str]) -> list[Job]:
     return [Job(words, root, plan_of(root)) for words, root in roots]
 
 
+def for_hydra(overrides: Sequence[str]) -> list[str]:
+    """The overrides of a sweep as Hydra's own launch takes them.
+
+    It first composes those with one value by themselves, without the groups that the sweep chooses, and refuses what only such
+    a group knows. As a choice of one, such a word waits for its job.
+    """
+
+    def known(word: str) -> bool:
+        try:
+            compose([word])
+        except UserError:
+            return False
+        return True
+
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    single = [word for word, override in zip(overrides, parsed, strict=True) if not override.is_sweep_override()]
+    waiting = {word for word in single if not is_hydras(word) and "=" in word and not known(word)}
+    return [
+        f"{name}=choice({value})" if word in waiting else word for word in overrides for name, _, value in [word.partition("=")]
+    ]
+
+
 def sweep_keys(overrides: Sequence[str]) -> dict[str, dict[str, str]]:
     """Keys of every job of a sweep, by the job's overrides."""
     return {job.name: keys_of(job.plan) for job in expand(overrides)}

@@ -48,6 +48,16 @@ def test_sweep_keys_are_known_before_it_runs(tmp_path):
     assert sweep_keys([*words, f"hydra.sweep.dir={tmp_path}"]) == keys  # Hydra leaves its own settings out of a job's name too
 
 
+def test_an_override_that_only_the_swept_group_knows(tmp_path):
+    (tmp_path / "ids.json").write_text('["0123456789abcdef0123456789abcdef"]')
+    sweep = "experiment=table1/full,table1/no_dpt"
+    done = run(tmp_path, "-m", sweep, f"collect.ids_file={tmp_path}/ids.json", "stage=collect", "plan=true")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("== ") == 2 and done.stdout.count("00 collect") == 2
+    bad = run(tmp_path, "-m", sweep, "collect.ids_fil=x", "stage=collect", "plan=true")
+    assert bad.returncode == 2 and bad.stderr.startswith("error: collect.ids_fil is unknown") and "Traceback" not in bad.stderr
+
+
 def test_what_jobs_share_is_said(tmp_path):
     jobs = expand(["stage=evaluate", "model=tiny,small", f"store={tmp_path}"])
     assert list(shared_stages(jobs)) == ["collect", "remesh", "decimate", "scene", "render", "shard"]
