@@ -149,6 +149,11 @@ class Artifact(_Records):
             raise self.damaged(f"manifest.json cannot be used ({error})") from None
 
     @property
+    def store(self) -> Store:
+        """The store that it lies in."""
+        return Store(self.path.absolute().parents[1])
+
+    @property
     def key(self) -> str:
         return self.manifest["key"]
 
@@ -710,6 +715,5 @@ def history(inputs: Mapping[str, Artifact]) -> dict[str, dict[str, Any]]:
         artifact = todo.pop()
         if artifact.stage not in found:
             found[artifact.stage] = artifact.manifest["preimage"]
-            store = Store(artifact.path.parents[1])
-            todo += [parent for _, _, parent in iter_inputs(store, artifact) if parent is not None]
+            todo += [parent for _, _, parent in iter_inputs(artifact.store, artifact) if parent is not None]
     return found

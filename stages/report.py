@@ -64,18 +64,18 @@ def load(words: Sequence[str], store: Store) -> tuple[list[Run], list[Probe]]:
         if count > 1:
             raise UserError(f"{key[:12]} is given {count} times: once is enough")
     evaluated = [(name, artifact) for name, artifact in given if artifact.stage == "evaluate"]
-    names = [name or default for (name, _), default in zip(evaluated, default_names(evaluated, store), strict=True)]
+    names = [name or default for (name, _), default in zip(evaluated, default_names(evaluated), strict=True)]
     for name, count in Counter(names).items():
         if count > 1:
             raise UserError(f"{count} runs are called {name!r}: give NAME=KEY")
-    runs = [load_run(artifact, store, name) for name, (_, artifact) in zip(names, evaluated, strict=True)]
+    runs = [load_run(artifact, name) for name, (_, artifact) in zip(names, evaluated, strict=True)]
     return runs, [load_probe(artifact) for _, artifact in given if artifact.stage == "probe"]
 
 
-def default_names(evaluated: Sequence[tuple[str, Artifact]], store: Store) -> list[str]:
+def default_names(evaluated: Sequence[tuple[str, Artifact]]) -> list[str]:
     """The models' names (``tiny``); where that would be said of two, the train artifacts' (``tiny-0123456789ab``)."""
     keys = [artifact.manifest["preimage"]["inputs"]["train"] for _, artifact in evaluated]
-    trained = [store.find("train", key) for key in keys]
+    trained = [artifact.store.find("train", key) for key, (_, artifact) in zip(keys, evaluated, strict=True)]
     folders = [train.path.name if train is not None else key[:12] for train, key in zip(trained, keys, strict=True)]
     if len(set(folders)) < len(folders):  # one model on several data
         folders = [f"{folder} on {artifact.path.name}" for folder, (_, artifact) in zip(folders, evaluated, strict=True)]

@@ -14,7 +14,7 @@ from pipeline.errors import UserError
 from pipeline.store import history
 
 if TYPE_CHECKING:
-    from pipeline.store import Artifact, Draft, Store
+    from pipeline.store import Artifact, Draft
 
 PROBE_FIELDS = ("name", "title", "question", "setting", "model", "columns", "rows", "notes")  # of probe.json
 CONFIGS = ("collect", "scene", "render", "train", "evaluate")  # stages whose settings the page shows
@@ -96,7 +96,7 @@ def _settings(params: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in params.items() if name != "identity"}
 
 
-def load_run(artifact: Artifact, store: Store, name: str) -> Run:
+def load_run(artifact: Artifact, name: str) -> Run:
     """The run of a finished artifact."""
     from stages.s07_evaluate import Evaluate
 
@@ -113,8 +113,8 @@ def load_run(artifact: Artifact, store: Store, name: str) -> Run:
         preimage["params"],
         json.loads(artifact.file("metrics.json").read_bytes()),
         json.loads(timing.read_bytes()) if timing.is_file() else None,
-        store.find("shard", preimage["inputs"]["shard"]),
-        store.find("train", preimage["inputs"]["train"]),
+        artifact.store.find("shard", preimage["inputs"]["shard"]),
+        artifact.store.find("train", preimage["inputs"]["train"]),
     )
 
 
