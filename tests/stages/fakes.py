@@ -21,6 +21,7 @@ class FakeArtifact:
     def __init__(self, path: Path, records: list[tuple[str, Record]]):
         self.path, self.files, self.notes, self.stage = path, path / "files", {}, path.name
         self.manifest = {"preimage": {"stage": self.stage, "version": 1, "params": {"seed": 0}, "inputs": {}}}
+        self.store = Store(path.parent)
         self.files.mkdir(parents=True, exist_ok=True)
         self._records = {record.id: (group, record) for group, record in records}
 
