@@ -31,7 +31,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
@@ -173,6 +172,9 @@ def loop_ratio(rounds: int = 3, n: int = 30_000_000) -> float:
     return statistics.median(2 * seconds(1) / seconds(2) for _ in range(rounds))
 
 
+WORKER = re.compile(r" items of \S+ \S+: process (\d+) on ")  # in a part's log
+
+
 class Arrival(NamedTuple):
     """A finished part: its key, the process that made it, seconds since the workers were asked for."""
 
@@ -192,7 +194,7 @@ def timed_stage(root: dict[str, Any], stage: str, workers: int) -> tuple[float, 
 
         def note(result: Any) -> None:
             at, log = time.perf_counter() - began, log_file(tasks[0].draft, result.part_key)
-            arrived.append(Arrival(result.part_key, STARTED.search(log.read_text())[2], at))
+            arrived.append(Arrival(result.part_key, WORKER.search(log.read_text())[1], at))
             on_result(result)
 
         run_parts(tasks, workers, threads, limits, note, log)
@@ -258,28 +260,18 @@ def bench_workers(work: Path, objects: int, scenes: int) -> None:
 # --- the paper's data -------------------------------------------------------------------------------------------------
 
 OF_OBJECTS, OF_SCENES = ("collect", "remesh", "decimate"), ("scene", "render", "shard")
-STARTED = re.compile(r"(\S+ \S+) \d+ items of \S+ \S+: process (\d+) on (\S+)")
-ITEM = re.compile(r"\S+ \S+ (\S+): ([0-9.]+) s, ")
+ITEM = re.compile(r"\S+ \S+ \S+: [0-9.]+ s, ([0-9.]+) s of CPU, ")
 
 
 def seconds_per_item(logs: Path) -> tuple[float, int]:
-    """Mean seconds of an item, and of how many: from an artifact's logs, less the first item of every process (imports)."""
-    parts = []
-    for path in logs.glob("*.log"):
-        told = path.read_text(errors="replace").splitlines()
-        started = next((match for text in told if (match := STARTED.match(text))), None)
-        if started:
-            taken = [float(match[2]) for text in told if (match := ITEM.match(text)) and "taken over" not in text]
-            parts.append((datetime.fromisoformat(started[1]), started[2] + started[3], taken))
-    seen, seconds = set(), []
-    for _, process, taken in sorted(parts):
-        seconds += taken[process not in seen :]
-        seen.add(process)
+    """Mean CPU seconds of an item, and of how many: from an artifact's logs, which tell a process' opening apart."""
+    told = (text for path in logs.glob("*.log") for text in path.read_text(errors="replace").splitlines())
+    seconds = [float(match[1]) for text in told if (match := ITEM.match(text)) and "taken over" not in text]
     return (statistics.mean(seconds) if seconds else 0.0), len(seconds)
 
 
 def measured(store: Store) -> dict[str, tuple[float, int, float, int]]:
-    """Stage -> (seconds per item, of how many items, bytes per record, records), of the newest artifact of each."""
+    """Stage -> (CPU seconds per item, of how many items, bytes per record, records), of the newest artifact of each."""
     found = {}
     for stage in OF_OBJECTS + OF_SCENES:
         artifacts: list[Artifact] = store.artifacts(stage)
@@ -319,7 +311,7 @@ def bench_model(work: Path, options: argparse.Namespace) -> None:
     store = Store(options.store) if options.store else make_sample(work, options.sample_scenes)
     found = measured(store)
     print(f"model: {options.objects:,} objects, {options.scenes:,} scenes of 4 views; per item as in {store.root}")
-    print(f"  {'':<9}{'s, one core':>12}{'items':>7}{'kB':>9}{'records':>9}{'of':>11}{'core-hours':>12}{'TB':>8}")
+    print(f"  {'':<9}{'CPU s':>12}{'items':>7}{'kB':>9}{'records':>9}{'of':>11}{'core-hours':>12}{'TB':>8}")
     hours: dict[str, float] = {}
     terabytes: dict[str, float] = {}
     for stage, (seconds, items, size, records) in found.items():

@@ -158,12 +158,31 @@ class _Failure:
     trace: str
 
 
+class _Stopwatch:
+    """Seconds since the last start, on the clock and of this process' CPU time; starts when made."""
+
+    def __init__(self) -> None:
+        self.start()
+
+    def start(self) -> None:
+        self._clock, self._cpu = time.monotonic(), time.process_time()
+
+    def __str__(self) -> str:
+        return f"{time.monotonic() - self._clock:.3f} s, {time.process_time() - self._cpu:.3f} s of CPU"
+
+
 def _run_part(task: PartTask, draft: Draft) -> PartResult:
     def say(text: str) -> None:
         write_log(task.draft, task.part_key, text)
 
+    watch = _Stopwatch()
+
     def compute(item: Item) -> list[Record] | Reject:
         _announce(task, item.id)
+        if (task.stage, task.key) not in _opened:  # paid once per process: imports, what the stage loads
+            _open(task)
+            say(f"{task.stage} opened: {watch}")
+            watch.start()
         stage, worker = _open(task)
         try:
             records = list(stage.process(worker, item))
@@ -183,7 +202,7 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
             return compute(item)
 
     def attempt(item: Item) -> list[Record] | Reject | _Failure:
-        began = time.monotonic()
+        watch.start()
         reuse = task.reuse.get(item.id)
         try:
             if reuse is None:
@@ -202,7 +221,7 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
         if isinstance(result, _Failure):
             what = f"FAILED\n{result.trace.rstrip()}"
         where = "" if reuse is None else ", taken over" + (f" from {reuse.artifact.name}" if reuse.artifact else "")
-        say(f"{item.id}: {time.monotonic() - began:.3f} s, {what}{where}")
+        say(f"{item.id}: {watch}, {what}{where}")
         return result
 
     say(f"{len(task.items)} items of {task.stage} {task.group or '-'}: process {os.getpid()} on {socket.gethostname()}")

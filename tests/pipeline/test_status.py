@@ -6,6 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
+from bench.scale import seconds_per_item
 from pipeline import commands
 from pipeline.errors import ItemsFailed
 from pipeline.store import Store
@@ -66,3 +67,13 @@ def test_every_part_leaves_a_log_outside_the_digest(tmp_path):
     for path in (artifact.path / "logs").iterdir():
         path.unlink()
     assert artifact.verify(deep=True) == []
+
+
+def test_logs_tell_the_time_of_items_from_that_of_opening(tmp_path):
+    assert finish(start(command(tmp_path, workers=1, numbers={"n": 15, "pause_s": 0.05})))[0] == 0
+    logs = Store(tmp_path).resolve("numbers").path / "logs"
+    seconds, items = seconds_per_item(logs)
+    assert items == 15 and seconds < 0.05  # waiting is no work
+    lines = [line for path in logs.iterdir() for line in path.read_text().splitlines()]
+    assert len([line for line in lines if "numbers opened: 0." in line]) == 1
+    assert all(float(line.split(": ")[1].split()[0]) >= 0.05 for line in lines if line.endswith("1 record(s)"))
