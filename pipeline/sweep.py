@@ -79,16 +79,17 @@ def for_hydra(overrides: Sequence[str]) -> list[str]:
     a group knows. As a choice of one, such a word waits for its job.
     """
 
-    def known(word: str) -> bool:
+    def known(words: Sequence[str]) -> bool:
         try:
-            compose([word])
+            compose(words)
         except UserError:
             return False
         return True
 
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     single = [word for word, override in zip(overrides, parsed, strict=True) if not override.is_sweep_override()]
-    waiting = {word for word in single if not is_hydras(word) and "=" in word and not known(word)}
+    asked = [word for word in single if not is_hydras(word) and "=" in word]
+    waiting = set() if known(asked) else {word for word in asked if not known([word])}
     return [
         f"{name}=choice({value})" if word in waiting else word for word in overrides for name, _, value in [word.partition("=")]
     ]
