@@ -8,7 +8,7 @@ this is ``stages.s06_train``. One design choice: a given checkpoint is an artifa
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -44,6 +44,9 @@ class TrainOrGiven(Train):
         if not isinstance(config, GivenConfig):
             return super().identity(config, hash_file)
         return {name: hash_file(path) for name, path in zip(FILES, checkpoint_files(config), strict=True)}
+
+    def estimate(self, config: Any, configs: Mapping[str, StageConfig]) -> list[str]:
+        return [] if isinstance(config, GivenConfig) else super().estimate(config, configs)
 
     def run(self, config: Any, inputs: Inputs, draft: Any) -> list[str]:
         if not isinstance(config, GivenConfig):

@@ -167,6 +167,17 @@ def test_the_papers_experiments_say_what_they_cost(name, days, paths, tmp_path):
     assert not list((tmp_path / "s").glob("*/*"))
 
 
+def test_a_given_checkpoint_is_planned_without_a_cost(tmp_path):
+    from pipeline.hydra_config import compose
+    from pipeline.runner import run_pipeline
+
+    words = ["stage=evaluate", "train=given", "train.checkpoint=model/pretrained", "plan=true", f"store={tmp_path}/s"]
+    lines = []
+    run_pipeline(compose(words), words, lines.append)
+    text = "\n".join(lines)
+    assert re.search(r"06 train +to make", text) and "07 evaluate" in text and "training:" not in text
+
+
 def test_resolution_must_suit_the_model(shard, tmp_path):
     draft = FakeArtifact(tmp_path, [])
     draft.state = tmp_path / "state"
