@@ -161,7 +161,10 @@ def load(job: Job, store: Store) -> Result | None:
 
 
 def difference(row: Result, base: Result) -> dict[str, dict[str, float]]:
-    """Metric -> row minus base, paired view by view and averaged, with its 95 % interval under resampling of scenes."""
+    """Metric -> row minus base, paired view by view and averaged, with its 95 % interval under resampling of scenes.
+
+    Over the scenes that both have: an item may have run out of time or memory in one of them.
+    """
     from stages.evaluation.statistics import bootstrap
 
     def scores(result: Result) -> dict[str, dict[int, Mapping[str, float]]]:
@@ -175,7 +178,7 @@ def difference(row: Result, base: Result) -> dict[str, dict[str, float]]:
     for metric in COLUMNS:
         pairs = [
             [ours[scene][view][metric] - theirs[scene][view][metric] for view in sorted(ours[scene])]
-            for scene in sorted(ours)
+            for scene in sorted(ours.keys() & theirs.keys())
             if metric in next(iter(ours[scene].values()))
         ]
         if pairs:
@@ -183,8 +186,8 @@ def difference(row: Result, base: Result) -> dict[str, dict[str, float]]:
     return found
 
 
-def settings(job: Job, result: Result | None) -> dict[str, str]:
-    """What the runs were, in the words of `PAPER`."""
+def settings(job: Job, full: Job | None, result: Result | None) -> dict[str, str]:
+    """What the runs were, in the words of `PAPER`: ``job`` is any of them, ``full`` the full model's if it is one of them."""
     config = {stage: planned.config for stage, planned in job.plan.items()}
     train, scene, render = config["train"], config["scene"], config["render"]
     augmentation = [
@@ -205,6 +208,8 @@ def settings(job: Job, result: Result | None) -> dict[str, str]:
         test = f"{result.metrics['scenes']:,} scenes, {result.metrics['views']:,} views"
     largest = train.max_triangles or getattr(scene, "max_triangles", None)
     views = f", {scene.cameras.views} views per scene" if hasattr(scene, "cameras") else ""
+    model = full.plan["train"].config.model if full is not None else None
+    size = f"{model.num_layers} + {model.view_transformer_n_layers} layers, width {model.latent_dim}" if model else "–"
     return {
         "training scenes": f"{scenes:,}",
         "objects": config["collect"].name if asked else "of imported scenes",
@@ -218,8 +223,7 @@ def settings(job: Job, result: Result | None) -> dict[str, str]:
         "loss": loss,
         "augmentation": ", ".join(augmentation) or "none",
         "start": start,
-        "full model": f"{train.model.num_layers} + {train.model.view_transformer_n_layers} layers, "
-        f"width {train.model.latent_dim}",
+        "full model": size,
     }
 
 
@@ -268,7 +272,7 @@ def gather(table: str, jobs: Mapping[str, Job]) -> dict[str, Any]:
             for name in ("mean_image", "constant", "direct")
         } if some else {},
         "shard": first.plan["shard"].key,
-        "settings": {"paper": PAPER, "here": settings(jobs.get(BASE, first), some)},
+        "settings": {"paper": PAPER, "here": settings(first, jobs.get(BASE), some)},
     }  # fmt: skip
 
 
@@ -297,11 +301,11 @@ def _format(metric: str, value: float | None, sign: str = "") -> str:
 
 def _with_interval(metric: str, value: Mapping[str, float] | None, sign: str = "") -> str:
     """Mean and interval; a difference whose interval leaves no doubt about its sign is bold."""
+    from stages.evaluation.statistics import decided, with_interval
+
     if value is None:
         return "–"
-    mean, low, high = (_format(metric, value[name], sign) for name in ("mean", "low", "high"))
-    sure = sign and (value["low"] > 0 or value["high"] < 0)
-    return f"{f'**{mean}**' if sure else mean} [{low}, {high}]"
+    return with_interval(value, lambda number: _format(metric, number, sign), bool(sign) and decided(value))
 
 
 def _pairs(ours: Mapping[str, Any], paper: Mapping[str, float], sign: str = "") -> list[str]:
@@ -390,7 +394,8 @@ def draw(found: Mapping[str, Any], path: Path) -> None:
         for place, row in enumerate(rows):
             ours = row.get("difference", {}).get(metric)
             if ours is not None:
-                axes.plot([ours["low"], ours["high"]], [place + 0.12] * 2, color="C0", linewidth=2, solid_capstyle="round")
+                if ours["low"] is not None:
+                    axes.plot([ours["low"], ours["high"]], [place + 0.12] * 2, color="C0", linewidth=2, solid_capstyle="round")
                 axes.plot(ours["mean"], place + 0.12, "o", color="C0", markersize=6)
             theirs = row.get("paper_difference", {}).get(metric)
             if theirs is not None:

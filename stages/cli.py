@@ -37,6 +37,7 @@ def command_trace(arguments: argparse.Namespace) -> int:
         denoise=arguments.denoise,
         seed=arguments.seed,
         view=arguments.view,
+        lights_visible=arguments.lights_visible,
         triangles=arguments.triangles,
         room=room(arguments),
     ):
@@ -75,12 +76,14 @@ def command_predict(arguments: argparse.Namespace) -> int:
 
 
 def command_compare(arguments: argparse.Namespace) -> int:
-    from stages.compare import IMAGES, compare_images, compare_scene
+    from stages.compare import IMAGES, check_picture, compare_images, compare_scene
     from stages.inference import write_png
     from stages.metrics import with_lpips
 
     first, out = Path(arguments.a), arguments.out
     metrics = with_lpips(arguments.lpips, arguments.lpips_folder)
+    if out is not None:
+        check_picture(Path(out), [first, *([Path(arguments.b)] if arguments.b is not None else [])])
     if arguments.b is not None or first.suffix.lower() in IMAGES:
         if arguments.b is None:
             raise UserError(f"{first} is an image: give the test image as well, or one scene instead of both")
@@ -102,11 +105,11 @@ def command_compare(arguments: argparse.Namespace) -> int:
             metrics=metrics,
         )
         out = out or f"{first.stem}-compare.png"
+    print(json.dumps(result.to_json(), indent=1) if arguments.json else result.table(), flush=True)
     if out is not None:
         write_png(Path(out), result.picture())
-    print(json.dumps(result.to_json(), indent=1) if arguments.json else result.table())
-    if out is not None and not arguments.json:
-        print(f"picture: {out}")
+        if not arguments.json:
+            print(f"picture: {out}")
     return 0
 
 
@@ -268,6 +271,8 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--mode", choices=("physical", "cycles"), default="physical", help="what the renderer matches")
     sub.add_argument("--denoise", action=argparse.BooleanOptionalAction, default=True, help="Open Image Denoise (default: on)")
     sub.add_argument("--seed", type=int, default=0)
+    sub.add_argument("--lights-visible", action="store_true",
+                     help="cameras see the lights (default: as in training, they do not)")  # fmt: skip
     sub.add_argument("--view", type=view_argument, default=0, help="camera number, or 'all' (default: 0)")
     add_mesh_options(sub, "as it is")
 

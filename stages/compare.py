@@ -9,7 +9,7 @@ are all those of ``stages.metrics``, so that a figure typed here can be set besi
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -165,6 +165,16 @@ def compare_scene(
     return Comparison(traced.image, predicted, names, measured, metrics, notes, ("target", "prediction"))
 
 
+def check_picture(out: Path, inputs: Sequence[Path]) -> None:
+    """UserError unless the comparison's picture can be written there: told before anything is computed."""
+    if out.suffix.lower() != ".png":
+        raise UserError(f"{out}: the picture must end in .png")
+    if not out.parent.is_dir():
+        raise UserError(f"the folder {out.parent} does not exist: make it first")
+    if out.resolve() in [path.resolve() for path in inputs]:
+        raise UserError(f"{out} is one of the images that are compared: give another name")
+
+
 def read_image(path: Path) -> np.ndarray:
     """(H, W, 3) float32 linear radiance of an EXR or PNG file."""
     suffix = path.suffix.lower()
@@ -185,9 +195,11 @@ def _read_png(path: Path) -> np.ndarray:
     try:
         with Image.open(path, formats=["PNG"]) as image:  # others run programs
             image.load()
+        with open(path, "rb") as file:
+            bits = file.read(25)[24]  # of IHDR, the first chunk: Pillow cuts 16 bits to 8 without a word
     except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise UserError(f"{path} is not a PNG image that can be read ({error})") from error
-    if image.mode.startswith(("I", "F")):
+    if bits > 8:
         raise UserError(f"{path} has 16 bits per channel: give an 8-bit PNG, or an EXR for more precision")
     if image.has_transparency_data and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
         raise UserError(f"{path} has transparent pixels: flatten it first, there is no colour behind them to compare")

@@ -7,9 +7,10 @@ MP4 files. One design choice: frames are made, checked and written one by one, w
 from __future__ import annotations
 
 import itertools
+import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -183,6 +184,8 @@ def predict(
         raise UserError(f"{out}: the output must end in .exr (linear), .png or .mp4")
     if not out.parent.is_dir():
         raise UserError(f"the folder {out.parent} does not exist: make it first")
+    if out.suffix.lower() == ".mp4":
+        earlier_frames(out.with_suffix(""))
     if tonemap not in TONE_MAPPERS:
         raise UserError(f"tone mapper {tonemap!r} is unknown: {', '.join(TONE_MAPPERS)}")
     if fps < 1:
@@ -190,7 +193,9 @@ def predict(
     renderer = Renderer(checkpoint, device, store)
     scene = renderer.load(scene_path, triangles, room)
     count = len(scene.fov_deg)
-    if not (view == "all" and frames is None) and not (isinstance(view, int) and 0 <= view < count):
+    if view == "all" and frames is not None:
+        raise UserError("an orbit starts at one camera: give --view N instead of --view all")
+    if view != "all" and not (isinstance(view, int) and 0 <= view < count):
         raise UserError(f"view {view} of {scene_path} does not exist: it has cameras 0 to {count - 1}, or say all")
     if frames is not None:
         scene = orbit(scene, frames, view, arc_deg)
@@ -219,27 +224,46 @@ def write_frames(
         exposure, images = exposure_for(first), itertools.chain([first], images)
     kind, written = out.suffix.lower(), []
 
-    def pictures(name: str) -> Iterator[np.ndarray]:
+    def pictures(place: Callable[[int], Path]) -> Iterator[np.ndarray]:
         for index, image in enumerate(images):
             picture = to_picture(image, exposure, tonemap)
-            path = out.parent / name.format(index)
-            write_png(path, picture)
-            written.append(path)
+            write_png(place(index), picture)
+            written.append(place(index))
             yield picture
 
     if kind == ".mp4":
-        out.with_suffix("").mkdir(exist_ok=True)
-        write_video(out, pictures(f"{out.stem}/{{:04}}.png"), fps)
+        folder = out.with_suffix("")
+        earlier = earlier_frames(folder)
+        folder.mkdir(exist_ok=True)
+        write_video(out, pictures(lambda index: folder / f"{index:04}.png"), fps)
+        for path in set(earlier) - set(written):  # of a longer video of that name
+            path.unlink()
         return [out, *written]
-    names = f"{out.stem}-{{}}{out.suffix}" if several else out.name
+
+    def place(index: int) -> Path:
+        return out.with_name(f"{out.stem}-{index}{out.suffix}") if several else out
+
     if kind == ".png":
-        for _ in pictures(names):
+        for _ in pictures(place):
             pass
         return written
     for index, image in enumerate(images):
-        written.append(out.with_name(names.format(index)))
+        written.append(place(index))
         write_rgb(written[-1], image)
     return written
+
+
+def earlier_frames(folder: Path) -> list[Path]:
+    """What a video's folder holds of an earlier one. UserError if it holds anything else."""
+    if not folder.exists():
+        return []
+    if not folder.is_dir():
+        raise UserError(f"{folder} is a file, and the video's frames go into a folder of that name: give another -o")
+    found = sorted(folder.iterdir())
+    for path in found:
+        if not re.fullmatch(r"[0-9]{4,}\.png", path.name):
+            raise UserError(f"{folder} is for the video's frames and holds {path.name}: give another -o, or empty it")
+    return found
 
 
 def write_png(path: Path, picture: np.ndarray) -> None:

@@ -39,7 +39,8 @@ def beyond_limits(
 ) -> list[str]:
     """A sentence for each limit of the training data that the scene, seen by ``views`` at (height, width) pixels, is beyond.
 
-    ``composite_lights``: it is rendered light by light, so that their number is no limit.
+    ``composite_lights``: it is rendered light by light, so that their number is no limit and each is to be as bright as
+    a single light of training.
     """
     return [
         *_size(scene, resolution, trained_with),
@@ -96,7 +97,10 @@ def _lights(scene: SceneRecord, one_by_one: bool) -> Iterator[str]:
     power = np.bincount(light, areas * emission.mean(axis=1), minlength=count)
     radiance = power / np.maximum(area, 1e-12)
     low, high = law.radiance
-    yield from _worst(np.array([radiance.sum()]), low, high, "lights of a total radiance of", digits=0)
+    if one_by_one:  # each pass has one light, which in training has all the radiance
+        yield from _worst(radiance, low, high, "a light, alone in its pass, of a radiance of", digits=0)
+    else:
+        yield from _worst(np.array([radiance.sum()]), low, high, "lights of a total radiance of", digits=0)
     small = 0.0022 * law.scale[0] ** 2  # of the light triangle, before it is scaled
     yield from _worst(area, small / 2, 2 * 0.0022 * law.scale[1] ** 2, "a light of area", digits=4)
     centres = np.stack([np.bincount(light, areas * triangles.mean(axis=1)[:, i], minlength=count) for i in range(3)], axis=1)

@@ -14,12 +14,10 @@ Each metric says in which `space` its best constant has a closed form, if in any
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -122,35 +120,41 @@ LPIPS_NETWORKS = {"vgg": "LPIPS (VGG)", "alex": "LPIPS (AlexNet)"}
 def with_lpips(network: str, folder: str | None) -> dict[str, Metric]:
     """`METRICS` and, unless ``network`` is "none", LPIPS with that network ("vgg" or "alex") on tone-mapped values.
 
-    The weights in ``folder`` are read at the first use; a UserError says where they can be had.
+    The weights are those in ``folder``; without them a UserError says where they can be had.
     """
     if network == "none":
         return dict(METRICS)
 
-    @functools.cache
-    def load() -> Any:
-        from model.losses import LPIPS
+    import torch
 
-        try:
-            return LPIPS.load(None if folder is None else Path(folder), network)
-        except ValueError as error:
-            raise UserError(str(error)) from None
+    from model.losses import LPIPS
+
+    try:
+        lpips = LPIPS.load(None if folder is None else Path(folder), network)
+    except ValueError as error:
+        raise UserError(str(error)) from None
 
     def measure(reference: np.ndarray, test: np.ndarray) -> float:
-        import torch
-
         images = [torch.from_numpy(tone_map(image).astype(np.float32)).permute(2, 0, 1)[None] for image in (reference, test)]
         with torch.no_grad():
-            return float(load()(*images))
+            return float(lpips(*images))
 
-    name = f"lpips_{network}"
-    return {**METRICS, name: Metric(name, LPIPS_NETWORKS[network], "", False, 4, None, measure)}
+    metric = _lpips(network, measure)
+    return {**METRICS, metric.name: metric}
+
+
+def _lpips(network: str, measure: Callable[[np.ndarray, np.ndarray], float]) -> Metric:
+    return Metric(f"lpips_{network}", LPIPS_NETWORKS[network], "", False, 4, None, measure)
 
 
 def named(names: Iterable[str]) -> dict[str, Metric]:
-    """The metrics of these names, in the order of their definition; their weights may be elsewhere, `format` needs none."""
+    """The metrics of these names, in the order of their definition, to be told, not measured: LPIPS without its weights."""
+
+    def absent(reference: np.ndarray, test: np.ndarray) -> float:
+        raise AssertionError("with_lpips has the metric with its weights")
+
     wanted = set(names)
-    known = {name: metric for network in ("none", *LPIPS_NETWORKS) for name, metric in with_lpips(network, None).items()}
+    known = METRICS | {metric.name: metric for network in LPIPS_NETWORKS for metric in [_lpips(network, absent)]}
     return {name: metric for name, metric in known.items() if name in wanted}
 
 

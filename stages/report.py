@@ -35,6 +35,9 @@ def write_report(
         raise UserError(f"{out}: the page must end in .html; the JSON and the Markdown lie beside it")
     if not out.parent.is_dir():
         raise UserError(f"{out.parent} is not a folder: make it first")
+    beside = [out.with_suffix(suffix) for suffix in (".json", ".md")]
+    if not out.exists() and (taken := [path.name for path in beside if path.exists()]):
+        raise UserError(f"{' and '.join(taken)} would be replaced, and there is no report {out.name}: give another name")
     runs, probes = load(words, store)
     if not different_data:
         check_same(runs)

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from pipeline.config import StageConfig, runtime
+from pipeline.config import StageConfig, count, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.device import choose_device
@@ -40,7 +40,7 @@ class EvaluateConfig(StageConfig):
     gallery: int = Field(24, ge=0)  # views shown in the report
     lpips: Literal["none", "vgg", "alex"] = "none"
     lpips_folder: str | None = runtime(None)  # where its weights lie; which they are is known from the network's name
-    timing_scenes: int = runtime(5, ge=0)  # scenes on which the stages are timed; 0: none
+    timing_scenes: int = count(5, ge=0)  # scenes on which the stages are timed, 0: none; no record depends on it
     device: Literal["auto", "cpu", "cuda"] = runtime("auto")
 
 
@@ -57,7 +57,7 @@ class Worker:
 class Evaluate(MapStage):
     name = "evaluate"
     headline = "report.html"
-    version = 2
+    version = 3
     inputs = ("shard", "train")
     Config = EvaluateConfig
 
@@ -152,17 +152,17 @@ class Evaluate(MapStage):
         from stages.evaluation.report import write_evaluation
         from stages.evaluation.runs import run_of
         from stages.evaluation.statistics import summarise
-        from stages.metrics import with_lpips
+        from stages.metrics import METRICS, named
 
         shard, train = inputs["shard"], inputs["train"]
         scenes = [unpack_json(draft.read(row.id, ("metrics.json",)).members["metrics.json"]) for row in draft.rows()]
-        metrics = with_lpips(config.lpips, None)
+        metrics = named({*METRICS, f"lpips_{config.lpips}"})
         summary = summarise(scenes, metrics)
         summary["ceiling"] = ceiling(scenes, config.split, *noise_pairs(shard, config.split))
         log = [json.loads(line) for line in train.file("log.jsonl").read_text().splitlines() if line]
         summary["train"] = {
             "key": train.key,
-            "steps": log[-1]["step"] if log else 0,
+            "steps": log[-1]["step"] if log else None,  # of a given checkpoint nobody knows
             **network(train.file("checkpoint")),
         }
         summary["data"] = {

@@ -20,14 +20,14 @@ def trace(
     denoise: bool = True,
     seed: int = 0,
     view: int | Literal["all"] = 0,
-    lights_visible: bool = True,
+    lights_visible: bool = False,
     backend: str = "auto",
     triangles: int | None = None,
     room: Room | None = None,
 ) -> list[Path]:
     """Write the view (or ``OUT-0.exr``, ``OUT-1.exr`` .. for all) as linear RGB and return the files' paths.
 
-    triangles, room: of a mesh, as of ``load_scene``.
+    triangles, room: of a mesh, as of ``load_scene``. lights_visible: to the camera; training images hide them.
     """
     from stages.exr import write_rgb
     from stages.rendering.backend import choose

@@ -20,7 +20,7 @@ import numpy as np
 from stages.compare import DIFFERENCE_GAIN, error_pictures
 from stages.evaluation import plots, tables
 from stages.evaluation.runs import Images, Probe, Run
-from stages.evaluation.statistics import BREAKDOWNS, worst_first
+from stages.evaluation.statistics import BREAKDOWNS, decided, worst_first
 from stages.evaluation.timing import PER_IMAGE, STEPS
 from stages.tonemap import exposure_for, to_picture
 
@@ -136,6 +136,7 @@ def page(runs: Sequence[Run], probes: Sequence[Probe] = (), limit: int = 24, tit
         table=table,
         best=tables.best_of(table, metrics) if runs and same else dict.fromkeys(metrics),
         told=tables.told,
+        decided=decided,
         verdicts=[tables.verdicts(summary) for summary in summaries],
         ceilings=_grouped([" ".join(tables.ceiling_lines(summary)) for summary in summaries], runs),
         shares=[(run.name, share) for run in runs if (share := tables.noise_share(run.summary)) is not None],

@@ -136,9 +136,10 @@ def facts(summary: Mapping[str, Any], key: str) -> dict[str, str]:
         f"{data['scenes'][split]:,} {split}" for split in ("train", "validation", "test") if split in data["scenes"]
     )
     resolution = summary["per_scene"][0]["resolution"]
+    trained = "a given checkpoint" if train["steps"] is None else f"{train['steps']:,} training steps"
     return {
         "model": f"{train['layers']} + {train['view_layers']} layers, width {train['width']}, "
-        f"{train['parameters']:,} parameters, {train['steps']:,} training steps",
+        f"{train['parameters']:,} parameters, {trained}",
         "data": f"{counts} scenes at {resolution}×{resolution} pixels; evaluated here: {data['split']}",
         **({} if "train" in data["scenes"] else {"mean training image": "of the evaluated scenes: there are no others"}),
         "train artifact": train["key"][:12],

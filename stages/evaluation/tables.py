@@ -6,15 +6,18 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from stages.evaluation.runs import Probe, Run
-from stages.evaluation.statistics import BARS, JUDGED, METHODS, difference
+from stages.evaluation.statistics import BARS, JUDGED, METHODS, Estimate, decided, difference, with_interval
 from stages.metrics import METRICS, Metric, named
 
 CEILING = "ceiling: noise of the ground truth"
 
 
-def told(metric: Metric, value: Mapping[str, float], sign: str = "") -> tuple[str, str, str]:
-    """Mean and both ends of its interval, as text."""
-    return tuple(metric.format(value[key], sign) for key in ("mean", "low", "high"))  # type: ignore[return-value]
+def told(metric: Metric, value: Estimate, sign: str = "") -> tuple[str, str]:
+    """Mean and its interval (``low to high``, "none: one scene alone"), as text."""
+    if value["low"] is None:
+        return metric.format(value["mean"], sign), "none: one scene alone"
+    mean, low, high = (metric.format(value[key], sign) for key in ("mean", "low", "high"))
+    return mean, f"{low} to {high}"
 
 
 def metrics_of(summaries: Collection[Mapping[str, Any]]) -> dict[str, Metric]:
@@ -28,11 +31,11 @@ def verdicts(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     for bar in BARS:
         for name in JUDGED:
             gain, metric = summary["gains"][bar][name], METRICS[name]
-            mean, low, high = told(metric, gain, "+")
+            mean, interval = told(metric, gain, "+")
             won = gain["mean"] > 0
             text = f"{'beats' if won else 'does not beat'} the {METHODS[bar]} in {metric.label}: gain "
-            text += f"{mean} {metric.unit}".rstrip() + f" (95 % interval {low} to {high})"
-            out.append({"won": won, "decided": gain["low"] > 0 or gain["high"] < 0, "text": text})
+            text += f"{mean} {metric.unit}".rstrip() + f" (95 % interval {interval})"
+            out.append({"won": won, "decided": decided(gain), "text": text})
     return out
 
 
@@ -40,10 +43,10 @@ def ceiling_lines(summary: Mapping[str, Any]) -> list[str]:
     """What the noise of the ground truth means for the scores, one sentence per metric that has a ceiling."""
     lines = []
     for name, ceiling in summary["ceiling"].items():
-        metric, (mean, low, high) = METRICS[name], told(METRICS[name], ceiling)
+        metric, (mean, interval) = METRICS[name], told(METRICS[name], ceiling)
         text = f"{metric.label}: the noiseless truth would score " + f"{mean} {metric.unit}".rstrip()
         source = {"pairs": "rendered twice", "estimates": "by the renderer's own estimate"}[ceiling["from"]]
-        text += f" (95 % interval {low} to {high}; {ceiling['views']} views of {ceiling['of']}, {source})"
+        text += f" (95 % interval {interval}; {ceiling['views']} views of {ceiling['of']}, {source})"
         lines.append(text + ".")
     return lines or ["No view of the data was rendered twice and none has an error estimate: the ceiling is unknown."]
 
@@ -149,11 +152,10 @@ def markdown(summary: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _cell(metric: Metric, value: Mapping[str, float] | None, bold: bool, sign: str = "") -> str:
+def _cell(metric: Metric, value: Estimate | None, bold: bool, sign: str = "") -> str:
     if value is None:
         return "–"
-    mean, low, high = told(metric, value, sign)
-    return f"**{mean}** [{low}, {high}]" if bold else f"{mean} [{low}, {high}]"
+    return with_interval(value, lambda number: metric.format(number, sign), bold)
 
 
 def _plain(cell: Any) -> str:

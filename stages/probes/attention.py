@@ -101,6 +101,7 @@ class Attention(Probe):
         from stages.exr import encode_rgb
 
         config, scene = worker.config, worker.base(item.id)
+        prediction = worker.predict(scene)  # first: it says what is wrong with a resolution
         view = worker.trace(scene)
         drawn = worker.trace(scene, config.drawn_px, max_spp=1, target_error=0.0, denoise=False).triangle
         patch = worker.model.config.patch_size
@@ -131,7 +132,7 @@ class Attention(Probe):
                 )
         facts = {"scene": item.id, "bundles": bundles, "triangles": len(scene.triangles), "weights": told}
         arrays = {"weights": weights[:, :, registers:].astype(np.float32), "triangle": drawn.astype(np.int32)}
-        members = {"reference.exr": encode_rgb(view.image), "prediction.exr": encode_rgb(worker.predict(scene))}
+        members = {"reference.exr": encode_rgb(view.image), "prediction.exr": encode_rgb(prediction)}
         yield Record(
             item.id, {"metrics.json": pack_json(facts), "weights.npz": pack_arrays(arrays, compressed=True), **members}
         )
@@ -154,7 +155,8 @@ class Attention(Probe):
             f"A scene has {triangles:,.0f} triangles on average and {registers} registers: spread evenly, the registers would "
             f"get {100 * registers / (registers + triangles):.1f} %.",
             "The bundle's own triangles are those that its 8 x 8 pixels see. Effective number of tokens: exp of the entropy.",
-            "In the figure the square marks the bundle; a layer's picture is scaled to the largest weight in it, given above.",
+            "In the figure the square marks the bundle; a layer's picture shows the square root of the weight over the "
+            "largest one in it, which is given above: what is half as bright has a quarter of the weight.",
         ]
         return Outcome(columns, rows, figure, notes)
 

@@ -129,15 +129,6 @@ def light_triangle(light: Light) -> np.ndarray:
     return meshes.LIGHT_TRIANGLE @ rotation_matrix(light.rotation_deg).T * light.scale + light.position
 
 
-def single_lights(scene: SceneRecord) -> list[SceneRecord]:
-    """The scene lit by each of its lights alone; the others' triangles are gone."""
-    out = []
-    for light in range(scene.n_lights):
-        alone = rows(scene, (scene.light_index < 0) | (scene.light_index == light))
-        out.append(replace(alone, light_index=np.where(alone.light_index == light, 0, -1).astype(np.int16)))
-    return out
-
-
 def exposed(scene: SceneRecord, factor: float) -> SceneRecord:
     """Every light ``factor`` times as bright."""
     return replace(scene, emission=scene.emission * np.float32(factor))

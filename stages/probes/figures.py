@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -48,7 +49,7 @@ def curve(
     axes: object, x: Sequence[float], found: Sequence[Mapping[str, float]], label: str, colour: str, line: str = "-"
 ) -> None:
     """Means over ``x`` with their intervals."""
-    mean, low, high = (np.array([row[key] for row in found]) for key in ("mean", "low", "high"))
+    mean, low, high = (np.array([row[key] for row in found], float) for key in ("mean", "low", "high"))  # None: nan, not drawn
     axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
     axes.plot(x, mean, line, color=colour, marker="o", markersize=4, linewidth=1.6, label=label)
 
@@ -99,7 +100,7 @@ def sweep_figure(
         if trained is not None:
             band = trained if axis != "even" else np.interp(trained, np.sort(values), places[order])
             axes.axvspan(*band, color="#8a939b", alpha=0.14, linewidth=0, label="in training")
-        for method, colour, line in zip(methods, COLOURS, LINES, strict=False):
+        for method, colour, line in zip(methods, cycle(COLOURS), cycle(LINES), strict=False):
             curve(axes, places[order], [lines[method][index] for index in order], method, colour, line)
         if places[0] > places[-1]:  # as the columns run
             axes.invert_xaxis()

@@ -322,14 +322,15 @@ class Sweep(Probe):
     def _changes(self, values: Sequence[float], methods: Sequence[str], scores: Callable[..., list[float]]) -> list[str]:
         """Sentences: what the same scenes lose from the first value to the last, and how the methods compare there."""
         from stages.evaluation.statistics import bootstrap
+        from stages.evaluation.tables import told
 
         metric, out = METRICS["psnr"], []
 
         def difference(a: tuple[str, float], b: tuple[str, float]) -> str:
             pairs = zip(scores(*a, metric.name), scores(*b, metric.name), strict=True)
             found = bootstrap([[second - first] for first, second in pairs])
-            mean, low, high = (metric.format(found[key], "+") for key in ("mean", "low", "high"))
-            return f"{mean} dB PSNR ({low} to {high})"
+            mean, interval = told(metric, found, "+")
+            return f"{mean} dB PSNR (95 % interval {interval})"
 
         if len(values) > 1:
             first, last = values[0], values[-1]
@@ -365,6 +366,6 @@ def span(numbers: Sequence[int]) -> str:
 
 def interval(name: str, found: Mapping[str, float]) -> str:
     """A metric's mean and its interval as text."""
-    metric = METRICS["log_error" if name == SURFACES else name]
-    mean, low, high = (metric.format(found[key]) for key in ("mean", "low", "high"))
-    return f"{mean} [{low}, {high}]"
+    from stages.evaluation.statistics import with_interval
+
+    return with_interval(found, METRICS["log_error" if name == SURFACES else name].format)

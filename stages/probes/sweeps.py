@@ -55,8 +55,10 @@ class Lights(Sweep):
         return edits.draw_nested_lights(scene, int(value), worker.rng("lights", scene.id))
 
     def methods(self, worker: Worker, predict: Predict, scene: SceneRecord) -> Methods:
+        from stages.predict import single_lights
+
         def composited(exposure: float) -> np.ndarray:
-            return sum(predict(edits.exposed(alone, exposure)) for alone in edits.single_lights(scene)) / exposure
+            return sum(predict(edits.exposed(alone, exposure)) for alone in single_lights(scene)) / exposure
 
         return {
             "all at once": lambda: predict(scene),

@@ -40,7 +40,7 @@ class TokensConfig(ProbeConfig):
     triangles: int = Field(32, ge=1)  # ... and of each from so many triangles, drawn by lot; of a held-out one, from all seen
     size: int = Field(32, ge=4, le=64)  # texels along a triangle's legs
     spp: int = Field(32, ge=1)  # samples per texel
-    steps: int = Field(400, ge=1)
+    steps: int = Field(400, ge=10)  # the first tenth warms up
     batch: int = Field(256, ge=1)  # triangles per step
     width: int = Field(512, ge=8)  # of the MLP
     lr: float = Field(1e-3, gt=0)
@@ -85,7 +85,7 @@ class Tokens(Probe):
         yield Record(item.id, {"texels.npz": pack_arrays(arrays, compressed=True)})
 
     def finish(self, worker: Worker, draft: Draft) -> Outcome:
-        from stages.evaluation.statistics import bootstrap
+        from stages.evaluation.statistics import bootstrap, with_interval
         from stages.probes.decoder import decode, fit_decoder
 
         config = worker.config
@@ -109,7 +109,7 @@ class Tokens(Probe):
         for name, by_scene in decoded.items():
             errors = {id: errors_of(by_scene[id], truth[id]["radiance"], truth[id]["met"]) for id in held}
             found = [bootstrap([[errors[id][part]] for id in held]) for part in range(3)]
-            rows.append([name, *(f"{f['mean']:.4f} [{f['low']:.4f}, {f['high']:.4f}]" for f in found)])
+            rows.append([name, *(with_interval(value, "{:.4f}".format) for value in found)])
         columns = [self.setting, "log error of texels", "of triangles' means", "of what varies within triangles"]
         fitted, judged = (sum(int(truth[id]["met"].any(axis=(1, 2)).sum()) for id in ids) for ids in (fit, held))
         notes = [

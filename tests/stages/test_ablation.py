@@ -148,9 +148,10 @@ def test_a_table_without_results_is_still_the_papers(jobs):
     table = "table1_small" if network(jobs, "full").latent_dim == 384 else "table1"
     text = markdown(gather(table, jobs))
     assert text.count("no result") == 12 and "29.77" in text
-    assert settings(jobs["full"], None).keys() == PAPER.keys()
+    assert settings(jobs["full"], jobs["full"], None).keys() == PAPER.keys()
+    assert settings(jobs["full"], None, None)["full model"] == "–"
     if table == "table1":  # what the configs can say of the paper's size is the paper's
-        here, paper = settings(jobs["full"], None), dict(PAPER)
+        here, paper = settings(jobs["full"], jobs["full"], None), dict(PAPER)
         same = ("training scenes", "triangles per scene, at most", "images", "samples per pixel, at most", "training",
                 "visits of each training scene", "optimizer", "loss", "start", "full model")  # fmt: skip
         assert {name: here[name] for name in same} == {name: paper[name] for name in same}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -55,6 +57,18 @@ def test_an_opaque_alpha_channel_and_grey_are_fine(tmp_path, images):
     assert np.array_equal(to_picture(read_image(tmp_path / "grey.png"))[..., 2], picture[..., 0])
 
 
+def png_of_16_bits(pixels: np.ndarray) -> bytes:
+    """(H, W, 3) big-endian uint16, which Pillow reads as 8 bits and cannot write."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    height, width = pixels.shape[:2]
+    rows = b"".join(b"\0" + row.tobytes() for row in pixels)
+    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
 def test_what_cannot_be_compared_is_said_in_one_line(tmp_path, images):
     a = images[0]
     write_rgb(tmp_path / "a.exr", a)
@@ -67,6 +81,7 @@ def test_what_cannot_be_compared_is_said_in_one_line(tmp_path, images):
     glass = np.dstack([to_picture(a), np.full(a.shape[:2], 128, np.uint8)])
     Image.fromarray(glass).save(tmp_path / "glass.png")
     Image.fromarray((a[..., 0] * 1000).astype(np.uint16)).save(tmp_path / "deep.png")
+    (tmp_path / "deep_rgb.png").write_bytes(png_of_16_bits((a * 1000).astype(">u2")))
     cases = {
         "wide.exr": "24x32x3 and 24x64x3",
         "nan.exr": "NaN or infinite",
@@ -75,6 +90,7 @@ def test_what_cannot_be_compared_is_said_in_one_line(tmp_path, images):
         "a.jpg": "EXR or PNG",
         "glass.png": "transparent",
         "deep.png": "16 bits",
+        "deep_rgb.png": "16 bits",
         "missing.exr": "is not a file",
         "": "is not a file",
     }
@@ -175,6 +191,10 @@ def test_two_images_as_a_picture(tmp_path, images, capsys):
         (["a.exr"], "is an image: give the test image as well"),
         (["a.exr", "b.exr", "--checkpoint", "x"], "leave --checkpoint out"),
         (["cube.stl", "b.exr"], "'.stl': compare takes two EXR or PNG images, or one scene"),
+        (["a.exr", "b.exr", "-o", "b.exr"], "must end in .png"),
+        (["a.exr", "b.exr", "-o", "nowhere/c.png"], "nowhere does not exist"),
+        (["a.exr", "b.png", "-o", "b.png"], "is one of the images that are compared"),
+        (["a.exr", "b.exr", "--lpips", "vgg", "--lpips-folder", "nowhere"], "LPIPS needs"),
         (["cube.stl", "--spp", "0", "--checkpoint", "model"], "0 samples per pixel"),
         (["cube.stl", "--resolution", "8", "--checkpoint", "model"], "SSIM needs 11"),
         (["cube.stl", "--view", "2", "--checkpoint", "model"], "view 2 of cube does not exist"),

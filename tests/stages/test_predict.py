@@ -267,6 +267,14 @@ def test_between_walls_an_orbit_swings_and_never_goes_behind_them(cube):
     assert np.ptp(orbit(scene, 32, arc_deg=360).camera_to_world[:, 0, 3]) > np.ptp(positions[:, 0])
 
 
+def test_a_shorter_video_leaves_no_frame_of_a_longer_one(checkpoint, cube, tmp_path):
+    from stages.inference import predict
+
+    for frames in (3, 2):
+        predict(cube, checkpoint, tmp_path / "a{b}.mp4", 16, device="cpu", frames=frames, room=Room("floor"))
+    assert [path.name for path in sorted((tmp_path / "a{b}").iterdir())] == ["0000.png", "0001.png"]
+
+
 def test_all_cameras_and_an_orbit_as_single_images(checkpoint, cube, tmp_path):
     words = ["predict", str(cube), "--checkpoint", str(checkpoint), "--resolution", "8", "--device", "cpu"]
     assert main([*words, "-o", str(tmp_path / "a.exr"), "--orbit", "2", "--arc", "20"]) == 0
@@ -353,6 +361,8 @@ def test_composited_lights_have_no_limit_in_number(cube):
     scene = many_lights(load_scene(cube, 640, Room("floor")), 12)
     sentences = [beyond_limits(scene, [0], (16, 16), {}, composite) for composite in (False, True)]
     assert any("12 lights" in s for s in sentences[0]) and not any("12 lights" in s for s in sentences[1])
+    # together they emit what the law says, and each alone a twelfth of it
+    assert any("alone in its pass" in s for s in sentences[1]) and not any("total radiance" in s for s in sentences[0])
 
 
 def test_twenty_thousand_triangles_are_a_warning(renderer, tmp_path, scene_json):
@@ -389,7 +399,8 @@ def bad_scenes() -> dict:
 @pytest.mark.parametrize("command", ["predict", "trace", "compare"])
 def test_a_bad_scene_is_named_in_one_line(checkpoint, scene_json, tmp_path, capsys, message, command):
     (tmp_path / "nan.obj").write_text("v 0 0 0\nv nan 0 0\nv 0 0.5 0\nf 1 2 3\n")
-    words = [command, str(scene_json(bad_scenes()[message])), "-o", str(tmp_path / "out.exr")]
+    out = tmp_path / ("out.png" if command == "compare" else "out.exr")
+    words = [command, str(scene_json(bad_scenes()[message])), "-o", str(out)]
     assert main(words + (["--checkpoint", str(checkpoint)] if command != "trace" else [])) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and message in error and error.count("\n") == 1
@@ -430,7 +441,9 @@ def test_a_missing_file_is_named(renderer, tmp_path):
         (["--view", "1"], "view 1 of"),
         (["--orbit", "0"], "an orbit of 0 frames"),
         (["--orbit", "2", "--arc", "400"], "an arc of 400 degrees"),
-        (["--orbit", "2", "--view", "all"], "view all of"),
+        (["--orbit", "2", "--view", "all"], "an orbit starts at one camera"),
+        (["--orbit", "2", "-o", "taken.mp4"], "taken is for the video's frames and holds chair.glb"),
+        (["--orbit", "2", "-o", "file.mp4"], "file is a file"),
         (["--tonemap", "sepia"], "none, reinhard, filmic, aces, agx, pbr_neutral"),
         (["--fps", "0"], "0 frames per second"),
         (["-o", "out.jpg"], "must end in .exr"),
@@ -442,6 +455,9 @@ def test_what_cannot_be_asked_for_is_said(checkpoint, cube, tmp_path, capsys, mo
     monkeypatch.chdir(tmp_path)
     if "-o" not in words:
         words = [*words, "-o", "out.png"]
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "chair.glb").write_bytes(b"")
+    (tmp_path / "file").write_bytes(b"")
     assert main(["predict", str(cube), "--checkpoint", str(checkpoint), "--device", "cpu", *words]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and message in error and error.count("\n") == 1
@@ -491,3 +507,16 @@ def test_trace_takes_meshes_too(cube, tmp_path):
 
     words = ["trace", str(cube), "-o", str(tmp_path / "out.exr"), "--resolution", "8", "--spp", "2", "--room", "floor"]
     assert main(words) == 0 and read_rgb(tmp_path / "out.exr").mean() > 0.05
+
+
+def test_a_traced_picture_shows_lights_where_asked(tmp_path, scene_json):
+    """The training data hides them from the camera, and so does trace unless told."""
+    from stages.exr import read_rgb
+
+    def look_up(scene):
+        scene["cameras"][0] |= {"position": [0.05, 0.05, 0.5], "look_at": [0.05, 0.05, 2.3], "up": [0, 1, 0]}
+
+    words = ["trace", str(scene_json(look_up)), "-o", str(tmp_path / "out.exr"), "--resolution", "16", "--spp", "4"]
+    for more, seen in (([], False), (["--lights-visible"], True)):
+        assert main([*words, "--no-denoise", *more]) == 0
+        assert (read_rgb(tmp_path / "out.exr").max() > 1000) == seen

@@ -12,6 +12,8 @@ import pytest
 from pipeline.config import parse
 from pipeline.errors import UserError
 from pipeline.hydra_config import CONF, compose
+from pipeline.runner import base_key, plan_stage
+from stages.predict import single_lights
 from stages.probes import attention, edits, made, tokens
 from stages.probes.probe import slug
 from stages.probes.sweeps import ColouredLight, Lights, TriangleSize
@@ -175,7 +177,7 @@ class TestMethods:
     def test_single_lights_add_up(self, scene):
         images = [image() for image in Lights().methods(None, self.predict, scene).values()]
         assert len(images) == 3 and all(np.allclose(image, images[0], rtol=1e-5) for image in images)
-        assert len(edits.single_lights(scene)) == scene.n_lights
+        assert len(list(single_lights(scene))) == scene.n_lights
 
     def test_channels_blend(self, scene):
         worker = SimpleNamespace(rng=lambda *_: np.random.default_rng(3))
@@ -329,7 +331,7 @@ def test_records_do_not_depend_on_the_clock_or_on_other_values(inputs, tmp_path)
 
 def test_tokens_are_decoded_on_held_out_scenes(inputs, jit, tmp_path, monkeypatch):  # noqa: F811
     monkeypatch.setitem(globals(), "SCALAR", jit)
-    small = {"fit_scenes": 2, "triangles": 8, "size": 4, "spp": 1, "steps": 3, "width": 16, "drawn_px": 24, "scenes": 1}
+    small = {"fit_scenes": 2, "triangles": 8, "size": 4, "spp": 1, "steps": 10, "width": 16, "drawn_px": 24, "scenes": 1}
     draft = run(inputs, tmp_path / "probe", name="tokens", **(TINY | small))
     rows = json.loads((draft.files / "probe.json").read_text())["rows"]
     assert len(rows) == 4 and float(rows[3][2].split()[0]) == 0  # the truth's own means have no error in the mean
@@ -368,6 +370,22 @@ def test_a_probe_that_no_scene_suits_says_so(inputs, tmp_path):
         Never().scene_ids(Never.Config(), inputs)
     with pytest.raises(UserError, match="ladder"):
         ProbeImported().reads(Never.Config())
+
+
+def test_what_a_record_holds_is_in_its_key():
+    """equal_time has all values in one record; of timing's settings none is in a record, but its artifact depends on them."""
+
+    def keys(name: str, **values) -> tuple[str, str]:
+        config = parse(RunProbe.Config, {"name": name, **values}, "probe")
+        planned = plan_stage(RunProbe(), config, {"shard": "a", "train": "b"}, str)
+        return planned.key, base_key(planned)
+
+    for one, other, same_items in (
+        (keys("equal_time"), keys("equal_time", values=[4, 128]), False),
+        (keys("timing"), keys("timing", frames=48, tracer_spp=16, repeats=1, threads=1), True),
+        (keys("fov"), keys("fov", values=[50], scenes=2), True),
+    ):
+        assert one[0] != other[0] and (one[1] == other[1]) == same_items
 
 
 def test_values_make_distinct_ids():

@@ -173,6 +173,10 @@ def test_what_cannot_be_shown_is_named(store, factor, tmp_path):
     two = evaluated(store, "two", shard_of(store), factor, 0.9)
     with pytest.raises(UserError, match="2 runs are called 'same'"):
         write_report([f"same={run.key}", f"same={two.key}"], store, out)
+    (tmp_path / "README.md").write_text("mine")
+    with pytest.raises(UserError, match="README.md would be replaced"):
+        write_report([run.key], store, tmp_path / "README.html")
+    assert (tmp_path / "README.md").read_text() == "mine"
     old = evaluated(store, "old", shard_of(store), factor, 0.9, version=1)
     with pytest.raises(UserError, match="version 1 of evaluate.*evaluate the model again"):
         write_report([old.key], store, out)
