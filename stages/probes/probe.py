@@ -42,7 +42,7 @@ class ProbeConfig(StageConfig):
     """What every probe has."""
 
     split: Literal["test", "validation", "train"] = "test"
-    scenes: int = count(4, ge=1)  # the first ones of the split that suit the probe
+    scenes: int = count(12, ge=1)  # the first ones of the split that suit the probe
     resolution: int = Field(64, ge=16, le=2048)  # pixels per side
     target_error: float = Field(0.002, ge=0)  # of the references, as in *render*
     max_spp: int = Field(256, ge=1)

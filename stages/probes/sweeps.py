@@ -233,7 +233,7 @@ class Fov(Sweep):
 
 class ResolutionConfig(ProbeConfig):
     name: Literal["resolution"] = "resolution"
-    scenes: int = count(3, ge=1)
+    scenes: int = count(6, ge=1)
     values: Values = count((32, 64, 96, 128, 192))
 
     _values = field_validator("values")(at_least(16, 4096, whole=True))

@@ -34,7 +34,7 @@ SWATCHES = 8  # triangles of each that are shown as textures
 
 class TokensConfig(ProbeConfig):
     name: Literal["tokens"] = "tokens"
-    scenes: int = count(2, ge=1)
+    scenes: int = count(6, ge=1)
     fit_split: Literal["train", "validation", "test"] = "train"  # the decoder learns from these scenes ...
     fit_scenes: int = Field(64, ge=1)
     triangles: int = Field(32, ge=1)  # ... and of each from so many triangles, drawn by lot; of a held-out one, from all seen
