@@ -81,7 +81,8 @@ def flip(reference: np.ndarray, test: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Metric:
-    """``measure(reference, test)`` takes linear HDR images; ``space`` is a key of ``baselines.SPACES`` or None."""
+    """``measure(reference, test)`` takes linear HDR images; ``space`` is a key of ``baselines.SPACES`` or None; ``bounds``: the
+    least and the largest value that there is."""
 
     name: str
     label: str
@@ -89,6 +90,7 @@ class Metric:
     higher_is_better: bool
     digits: int
     space: str | None
+    bounds: tuple[float, float]
     measure: Callable[[np.ndarray, np.ndarray], float]
 
     @property
@@ -104,14 +106,23 @@ class Metric:
 METRICS: Mapping[str, Metric] = {
     metric.name: metric
     for metric in (
-        Metric("psnr", "PSNR", "dB", True, 2, "linear", lambda a, b: psnr(clamp(a), clamp(b))),
-        Metric("ssim", "SSIM", "", True, 4, None, lambda a, b: ssim(clamp(a), clamp(b))),
-        Metric("psnr_tm", "PSNR, tone-mapped", "dB", True, 2, "tone_mapped", lambda a, b: psnr(tone_map(a), tone_map(b))),
-        Metric("ssim_tm", "SSIM, tone-mapped", "", True, 4, None, lambda a, b: ssim(tone_map(a), tone_map(b))),
-        Metric("log_error", "log error", "", False, 4, "log", log_error),
-        Metric("flip", "HDR-FLIP", "", False, 4, None, flip),
+        Metric("psnr", "PSNR", "dB", True, 2, "linear", (0, PSNR_MAX), lambda a, b: psnr(clamp(a), clamp(b))),
+        Metric("ssim", "SSIM", "", True, 4, None, (-1, 1), lambda a, b: ssim(clamp(a), clamp(b))),
+        Metric(
+            "psnr_tm",
+            "PSNR, tone-mapped",
+            "dB",
+            True,
+            2,
+            "tone_mapped",
+            (0, PSNR_MAX),
+            lambda a, b: psnr(tone_map(a), tone_map(b)),
+        ),
+        Metric("ssim_tm", "SSIM, tone-mapped", "", True, 4, None, (-1, 1), lambda a, b: ssim(tone_map(a), tone_map(b))),
+        Metric("log_error", "log error", "", False, 4, "log", (0, np.inf), log_error),
+        Metric("flip", "HDR-FLIP", "", False, 4, None, (0, 1), flip),
     )
-}
+}  # fmt: skip
 
 
 LPIPS_NETWORKS = {"vgg": "LPIPS (VGG)", "alex": "LPIPS (AlexNet)"}
@@ -144,7 +155,7 @@ def with_lpips(network: str, folder: str | None) -> dict[str, Metric]:
 
 
 def _lpips(network: str, measure: Callable[[np.ndarray, np.ndarray], float]) -> Metric:
-    return Metric(f"lpips_{network}", LPIPS_NETWORKS[network], "", False, 4, None, measure)
+    return Metric(f"lpips_{network}", LPIPS_NETWORKS[network], "", False, 4, None, (0, np.inf), measure)
 
 
 def named(names: Iterable[str]) -> dict[str, Metric]:

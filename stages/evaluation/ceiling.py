@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from stages.evaluation.statistics import Scene, bootstrap
+from stages.metrics import METRICS
 
 if TYPE_CHECKING:
     from pipeline.store import Artifact
@@ -62,7 +63,7 @@ def ceiling(scenes: Sequence[Scene], split: str, pairs: Sequence[Sequence[Mappin
     def tell(metric: str, values: Sequence[Sequence[float]], of: str, source: str) -> None:
         if values:
             counts = {"views": sum(map(len, values)), "scenes": len(values)}
-            told[metric] = {**bootstrap(values), **counts, "of": of, "from": source}
+            told[metric] = {**bootstrap(values, METRICS[metric].bounds), **counts, "of": of, "from": source}
 
     estimates = [[view["noise"]["log_error"] for view in scene["views"]] for scene in scenes]
     estimates = [known for scene in estimates if (known := [value for value in scene if value is not None])]

@@ -7,7 +7,7 @@ view before they are averaged: what makes a view hard is the same for both and d
 Resampling few scenes makes intervals that are too narrow: its variance is (n - 1) / n of what it should be, and it knows
 nothing of how uncertain that is. The ends' distances from the mean are therefore multiplied by t / 1.96 sqrt(n / (n - 1)), t
 being the 97.5 % quantile of Student's distribution of n - 1 degrees of freedom (Hesterberg 2015): 1.06 for 32 scenes, 1.9 for
-4. One scene has no interval.
+4. One or two have no interval.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ METHODS: Mapping[str, str] = {
 BARS = ("mean_image", "constant")  # what the model has to beat ...
 JUDGED = ("psnr", "log_error")  # ... in these metrics
 RESAMPLES = 2000
+LEAST_SCENES = 3  # for an interval: that of two would be nine times as wide as they lie apart
 
 Scene = Mapping[str, Any]  # a record's metrics.json, see stages.s07_evaluate
 View = Mapping[str, Any]  # one of its views
@@ -96,19 +97,19 @@ def _widening(count: int) -> float:
     return float(stdtrit(count - 1, 0.975) / ndtri(0.975) * np.sqrt(count / (count - 1)))
 
 
-def bootstrap(values: Sequence[Sequence[float]]) -> Estimate:
+def bootstrap(values: Sequence[Sequence[float]], bounds: tuple[float, float] = (-np.inf, np.inf)) -> Estimate:
     """Mean over all values (one sequence per scene) and its 95 % interval under resampling of scenes.
 
-    ``{"mean", "low", "high"}``; of a single scene the ends are None.
+    ``{"mean", "low", "high"}``; of fewer than `LEAST_SCENES` the ends are None. ``bounds``: of what a value can be.
     """
     sums = np.array([sum(scene) for scene in values])
     counts = np.array([len(scene) for scene in values])
     mean, count = float(sums.sum() / counts.sum()), len(values)
-    if count < 2:
+    if count < LEAST_SCENES:
         return {"mean": mean, "low": None, "high": None}
     draws = _draws(count)
     ends = np.percentile((draws @ sums) / (draws @ counts), [2.5, 97.5])
-    low, high = mean + (ends - mean) * _widening(count)
+    low, high = np.clip(mean + (ends - mean) * _widening(count), *bounds)
     return {"mean": mean, "low": float(low), "high": float(high)}
 
 
@@ -146,7 +147,7 @@ def _breakdown(scenes: Sequence[Scene], key: str, metrics: Mapping[str, Metric])
         row: dict[str, Any] = {"value": value, "scenes": len(some), "views": sum(len(scene["views"]) for scene in some)}
         for method in METHODS:
             row[method] = {name: float(np.mean(np.concatenate(_column(some, method, name)))) for name in metrics}
-        model = {name: bootstrap(_column(some, "model", name)) for name in metrics}
+        model = {name: bootstrap(_column(some, "model", name), metric.bounds) for name, metric in metrics.items()}
         row["interval"] = {n: None if value["low"] is None else [value["low"], value["high"]] for n, value in model.items()}
         out.append(row)
     return out
@@ -163,7 +164,10 @@ def summarise(scenes: Sequence[Scene], metrics: Mapping[str, Metric] = METRICS) 
     return {
         "scenes": len(scenes),
         "views": sum(len(scene["views"]) for scene in scenes),
-        "methods": {method: {name: bootstrap(column) for name, column in row.items()} for method, row in columns.items()},
+        "methods": {
+            method: {name: bootstrap(column, metrics[name].bounds) for name, column in row.items()}
+            for method, row in columns.items()
+        },
         "gains": gains,
         "beats_baselines": all(gains[bar][name]["mean"] > 0 for bar in BARS for name in JUDGED),
         "bins": {key: breakdown.about for key, breakdown in BREAKDOWNS.items()},

@@ -13,9 +13,9 @@ CEILING = "ceiling: noise of the ground truth"
 
 
 def told(metric: Metric, value: Estimate, sign: str = "") -> tuple[str, str]:
-    """Mean and its interval (``low to high``, "none: one scene alone"), as text."""
+    """Mean and its interval (``low to high``, "none: too few scenes"), as text."""
     if value["low"] is None:
-        return metric.format(value["mean"], sign), "none: one scene alone"
+        return metric.format(value["mean"], sign), "none: too few scenes"
     mean, low, high = (metric.format(value[key], sign) for key in ("mean", "low", "high"))
     return mean, f"{low} to {high}"
 

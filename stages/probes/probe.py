@@ -22,7 +22,7 @@ from pipeline.errors import Reject, UserError
 from pipeline.keys import seed_for
 from pipeline.stage import Inputs, Item, Record
 from stages.arrays import pack_json, unpack_json
-from stages.metrics import METRICS
+from stages.metrics import METRICS, Metric
 from stages.probes import edits
 from stages.records import SceneRecord
 
@@ -265,7 +265,7 @@ class Sweep(Probe):
             return [found[scene, value]["scores"][method][metric] for scene in whole]
 
         summary = {
-            (method, value, metric): bootstrap([[score] for score in scores(method, value, metric)])
+            (method, value, metric): bootstrap([[score] for score in scores(method, value, metric)], metric_of(metric).bounds)
             for method in methods
             for value in config.values
             for metric in SHOWN
@@ -368,4 +368,8 @@ def interval(name: str, found: Mapping[str, float]) -> str:
     """A metric's mean and its interval as text."""
     from stages.evaluation.statistics import with_interval
 
-    return with_interval(found, METRICS["log_error" if name == SURFACES else name].format)
+    return with_interval(found, metric_of(name).format)
+
+
+def metric_of(name: str) -> Metric:
+    return METRICS["log_error" if name == SURFACES else name]

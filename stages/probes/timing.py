@@ -20,7 +20,7 @@ from pipeline.config import count
 from pipeline.stage import Inputs, Item, Record
 from stages.arrays import pack_json, unpack_json
 from stages.probes import edits
-from stages.probes.probe import HEADINGS, SHOWN, Outcome, Probe, ProbeConfig, Worker, interval, measure, slug, span
+from stages.probes.probe import HEADINGS, SHOWN, Outcome, Probe, ProbeConfig, Worker, interval, measure, metric_of, slug, span
 from stages.probes.sweeps import at_least
 from stages.records import SceneRecord
 
@@ -268,7 +268,7 @@ class EqualTime(Probe):
         }
 
         def summary(get: Callable[[dict], dict[str, float]]) -> dict[str, dict[str, float]]:
-            return {metric: bootstrap([[get(fact)[metric]] for fact in facts]) for metric in SHOWN}
+            return {metric: bootstrap([[get(fact)[metric]] for fact in facts], metric_of(metric).bounds) for metric in SHOWN}
 
         found: dict[tuple[str, float | None], dict] = {("network", None): summary(lambda fact: fact["model"])}
         for method, spp in traced_s:
@@ -305,7 +305,8 @@ class EqualTime(Probe):
             for at in (0, -1):
                 axes.annotate(f"{config.values[at]:g}", (x[at], y[at]), (3, 4), textcoords="offset points", fontsize=7)
         model = found["network", None]["log_error"]
-        error = [[model["mean"] - model["low"]], [model["high"] - model["mean"]]]
+        low = model["low"]
+        error = None if low is None else [[model["mean"] - low], [model["high"] - model["mean"]]]
         axes.errorbar([model_s], [model["mean"]], error, color=COLOURS[0], marker="s", capsize=3, label="network")
         axes.set(xscale="log", yscale="log")
         axes.set_xlabel("seconds per picture (numbers: samples per pixel)", fontsize=8.5)

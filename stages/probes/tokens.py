@@ -86,6 +86,7 @@ class Tokens(Probe):
 
     def finish(self, worker: Worker, draft: Draft) -> Outcome:
         from stages.evaluation.statistics import bootstrap, with_interval
+        from stages.metrics import METRICS
         from stages.probes.decoder import decode, fit_decoder
 
         config = worker.config
@@ -108,7 +109,7 @@ class Tokens(Probe):
         rows = []
         for name, by_scene in decoded.items():
             errors = {id: errors_of(by_scene[id], truth[id]["radiance"], truth[id]["met"]) for id in held}
-            found = [bootstrap([[errors[id][part]] for id in held]) for part in range(3)]
+            found = [bootstrap([[errors[id][part]] for id in held], METRICS["log_error"].bounds) for part in range(3)]
             rows.append([name, *(with_interval(value, "{:.4f}".format) for value in found)])
         columns = [self.setting, "log error of texels", "of triangles' means", "of what varies within triangles"]
         fitted, judged = (sum(int(truth[id]["met"].any(axis=(1, 2)).sum()) for id in ids) for ids in (fit, held))

@@ -122,7 +122,10 @@ def test_differences_are_paired_by_view():
 
 
 def test_the_table_says_what_ran_what_did_not_and_what_differs(monkeypatch, tmp_path, capsys):
-    made = {"full": result({"a": [20.0, 30.0], "b": [10.0]}), "no_dpt": result({"a": [19.0, 29.0], "b": [9.0]})}
+    made = {
+        "full": result({"a": [20.0, 30.0], "b": [10.0], "c": [20.0]}),
+        "no_dpt": result({"a": [19.0, 29.0], "b": [9.0], "c": [19.0]}),
+    }
     monkeypatch.setattr(
         ablation, "load", lambda job, store: made.get(job.plan["train"].config.model.name.replace("base", "full"))
     )

@@ -125,9 +125,10 @@ class TestStatistics:
         assert 0.3 < found["high"] - found["low"] < 0.6
         assert bootstrap(values) == found
         assert bootstrap([[3.0, 5.0]]) == {"mean": 4, "low": None, "high": None}
+        assert bootstrap([[3.0], [3.1]])["low"] is None and bootstrap([[0.8], [1.0], [0.9]], (0, 1))["high"] == 1
         assert not decided(bootstrap([[3.0, 5.0]])) and decided(bootstrap([[3.0], [3.1], [3.2]]))
 
-    @pytest.mark.parametrize("count", [2, 3, 4, 8])
+    @pytest.mark.parametrize("count", [3, 4, 8, 23])
     def test_intervals_of_few_scenes_hold_the_truth_as_often_as_they_say(self, count):
         rng = np.random.default_rng(1)
         found = [bootstrap(rng.normal(size=(count, 1))) for _ in range(300)]
@@ -161,7 +162,7 @@ class TestStatistics:
         assert worst_first([scenes], 0) == []
 
     def test_breakdowns_put_views_into_the_bins_that_they_state(self):
-        scenes = [scene(f"{n}", [float(n), 7.0], 0, triangles=n) for n in (256, 257, 9000)]
+        scenes = [scene(f"{n}", [psnr, 7.0], 0, triangles=n) for n, psnr in ((256, 10.0), (257, 20.0), (9000, 40.0))]
         for some, roughness in zip(scenes, (0.05, 0.1, None), strict=True):
             some["views"][1]["roughness"] = roughness
         by = summarise(scenes)["by"]
@@ -171,18 +172,19 @@ class TestStatistics:
         rough = {row["value"]: row for row in by["roughness"]}
         assert list(rough) == [ROUGHNESS_BINS[0], ROUGHNESS_BINS[1], "0.2–0.4", "nothing glossy"]
         assert (rough["0.2–0.4"]["scenes"], rough["0.2–0.4"]["views"]) == (3, 3)
-        assert rough["0.2–0.4"]["model"]["psnr"] == pytest.approx((256 + 257 + 9000) / 3)
+        assert rough["0.2–0.4"]["model"]["psnr"] == pytest.approx((10 + 20 + 40) / 3)
         low, high = rough["0.2–0.4"]["interval"]["psnr"]
-        assert low < 256 and high > 9000  # three scenes do not span what a fourth may be
+        assert 0 <= low < 10 and 40 < high <= 100  # three scenes do not span what a fourth may be
         assert rough["< 0.1"]["interval"]["psnr"] is None  # one scene has no spread
 
     def test_a_difference_between_runs_is_paired_and_positive_where_the_first_is_better(self):
         base = [scene(name, [psnr, psnr + 20], 0) for name, psnr in (("a", 10.0), ("b", 30.0), ("c", 50.0))]
         ours = [scene(some["id"], [view["scores"]["model"]["psnr"] + 1 for view in some["views"]], 0) for some in base]
-        found = difference(ours[::-1], base, {"a", "b"})
-        assert (found["scenes"], found["views"]) == (2, 4)
+        found = difference(ours[::-1], base, {"a", "b", "c"})
+        assert (found["scenes"], found["views"]) == (3, 6)
         for name in ("psnr", "flip"):  # a gain in every metric, and the same in every view: no spread is left
             assert found["gains"][name] == pytest.approx({"mean": 1, "low": 1, "high": 1})
+        assert difference(ours, base, {"a", "b"})["gains"]["psnr"]["low"] is None
         assert difference(ours, base, set()) is None
 
     def test_several_runs_rank_the_views_that_they_share_by_their_mean(self):

@@ -100,7 +100,7 @@ def probe(store: Store) -> Artifact:
 
 @pytest.fixture
 def store(tmp_path, factor) -> Store:
-    _, shard = sharded(tmp_path, train=2, test=2)
+    _, shard = sharded(tmp_path, train=2, test=3)
     return Store(shard.path.parents[1])
 
 
@@ -124,7 +124,7 @@ def test_runs_and_probes_on_one_page(store, factor, tmp_path):
     assert [run["name"] for run in numbers["runs"]] == ["close <by>", "far"]
     psnr = [run["methods"]["model"]["psnr"]["mean"] for run in numbers["runs"]]
     against = numbers["differences"]
-    assert against["base"] == "close <by>" and (against["runs"]["far"]["scenes"], against["runs"]["far"]["views"]) == (2, 6)
+    assert against["base"] == "close <by>" and (against["runs"]["far"]["scenes"], against["runs"]["far"]["views"]) == (3, 9)
     assert against["runs"]["far"]["gains"]["psnr"]["mean"] == pytest.approx(psnr[1] - psnr[0])
     assert against["runs"]["far"]["gains"]["flip"]["high"] < 0  # worse, although its error is higher
     assert numbers["probes"][0]["rows"] == [[1, "20 <b>"], [8, None]]
@@ -145,10 +145,10 @@ def test_a_page_may_hold_probes_alone(store, tmp_path):
 
 def test_runs_on_different_scenes_are_refused_unless_asked(store, factor, tmp_path):
     one = evaluated(store, "one", shard_of(store), factor, 0.9)
-    more = dataset_inputs(tmp_path / "more", train=3, test=3)
+    more = dataset_inputs(tmp_path / "more", train=3, test=4)
     other_shard = commit_shards(store.root, more, Shard(), ShardConfig(shard_mb=1), 4)
     other = evaluated(store, "other", other_shard, factor, 0.8)
-    with pytest.raises(UserError, match=r"different scenes.*2 test scenes.*3 test scenes.*--different-data"):
+    with pytest.raises(UserError, match=r"different scenes.*3 test scenes.*4 test scenes.*--different-data"):
         write_report([one.key, other.key], store, tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
     write_report([one.key, other.key], store, tmp_path / "page.html", different_data=True)
@@ -196,4 +196,4 @@ def test_without_its_shards_a_run_still_has_numbers(store, factor, tmp_path):
         write_report(runs, store, tmp_path / "page.html")
     write_report(runs, store, tmp_path / "page.html", gallery=0)
     assert "No view is shown" in (tmp_path / "page.html").read_text()
-    assert json.loads((tmp_path / "page.json").read_text())["differences"]["runs"]["bb"]["scenes"] == 2
+    assert json.loads((tmp_path / "page.json").read_text())["differences"]["runs"]["bb"]["scenes"] == 3
