@@ -87,7 +87,7 @@ class ColouredLightConfig(ProbeConfig):
 class ColouredLight(Sweep):
     name = "coloured_light"
     title = "Coloured light, by blending channels"
-    question = "Training lights are white: is coloured light predicted better channel by channel, each under white light?"
+    question = "The released lights are white: is coloured light predicted better channel by channel, each under white light?"
     setting = "saturation of the lights"
     Config = ColouredLightConfig
 
