@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import re
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -247,9 +246,7 @@ def command_gc(store: Store, arguments: argparse.Namespace) -> int:
         total += count
         print(f"{'deleting' if arguments.delete else 'would delete'} {path.relative_to(store.root)}  {size(count)}  {reason}")
         if arguments.delete:
-            aside = path.with_name(f".gone-{path.name}")
-            path.rename(aside)  # out of sight at once: a kill in the middle leaves no half artifact
-            shutil.rmtree(aside)
+            store.remove(path)
     verb = "freed" if arguments.delete else "to free; nothing was deleted, add --delete"
     print(f"{len(found)} entries, {size(total)} {verb}")
     return 0

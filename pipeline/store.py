@@ -50,6 +50,7 @@ from pipeline.stage import Record
 SCHEMA = 2  # of manifests; from 2 on they are sealed, so that a changed byte shows
 STALE_CLAIM_S = 120.0  # another host's claim without a heartbeat for this long is taken over
 DRAFT = "draft.json"  # what is being made; stays with the artifact
+TRASH = (".trash/*", "[!.]*/.gone-*", "[!.]*/*/.gone-*")  # the last two: how an earlier gc named what it was deleting
 WORKING = ("markers", "running", "state")  # folders of a draft that its artifact does not keep
 
 
@@ -531,7 +532,7 @@ class Store:
 
     def folder(self, stage: str, key: str) -> Path | None:
         """The folder of the committed artifact, sound or damaged."""
-        return next(iter((self.root / stage).glob(f"*-{key[:12]}")), None)
+        return next(iter((self.root / stage).glob(f"[!.]*-{key[:12]}")), None)
 
     def find(self, stage: str, key: str) -> Artifact | None:
         """The committed artifact; an error where its manifest is damaged."""
@@ -553,7 +554,7 @@ class Store:
         return sorted(path for path in found if (path / "manifest.json").exists() or (path / DRAFT).exists())
 
     def drafts(self) -> list[Path]:
-        return sorted(self.root.glob("[!.]*/*.partial"))
+        return sorted(self.root.glob("[!.]*/[!.]*.partial"))
 
     def resolve(self, reference: str) -> Artifact:
         """The artifact that a person means: a key or its beginning, ``stage/folder``, a folder, or a stage's newest."""
@@ -612,9 +613,7 @@ class Store:
         else:
             target = self.root / draft.stage / f"{slug}-{draft.key[:12]}"
             if old is not None:
-                trash = self.root / ".trash"
-                trash.mkdir(exist_ok=True)
-                os.replace(old, trash / f"{draft.stage}-{old.name}-{uuid.uuid4().hex[:8]}")
+                self.trash(old)
             os.replace(draft.path, target)
             sync_folder(target.parent)
             for folder in WORKING:  # only now: until the rename they are what a resume needs
@@ -647,13 +646,33 @@ class Store:
         else:
             path.unlink(missing_ok=True)
 
+    def trash(self, path: Path) -> Path:
+        """Take a folder of the store out of sight by one rename; returns where it lies until gc empties the trash."""
+        aside = self.root / ".trash" / f"{'-'.join(path.relative_to(self.root).parts)}-{uuid.uuid4().hex[:8]}"
+        aside.parent.mkdir(exist_ok=True)
+        os.replace(path, aside)
+        return aside
+
+    def remove(self, path: Path) -> None:
+        """Delete what ``garbage`` listed: out of sight first, so that a kill in the middle leaves no half artifact."""
+        if path.parent.name != ".trash" and not path.name.startswith(".gone-"):
+            path = self.trash(path)
+
+        def failed(function: Any, name: str, error: Any) -> None:
+            if not issubclass(error[0], FileNotFoundError):  # another gc is faster
+                raise error[1]
+
+        shutil.rmtree(path, onerror=failed)
+
     def garbage(self, days: float) -> list[tuple[Path, str]]:
         """What can go, with the reason: trash, drafts nobody works on, and artifacts nobody needs.
 
         An artifact is needed while it is pinned, was used within ``days``, or is an input of one that is needed.
         """
         horizon = time.time() - days * 86400
-        found: list[tuple[Path, str]] = [(path, "replaced by a forced rerun") for path in self.root.glob(".trash/*")]
+        found: list[tuple[Path, str]] = []
+        for pattern in TRASH:
+            found += [(path, "trash: replaced, or left by a gc that was interrupted") for path in self.root.glob(pattern)]
         for path in self.drafts():
             claim = self.claim(path.parent.name, path.name.removesuffix(".partial"))
             if claim.holder() is None and (path / "markers").exists() and (path / "markers").stat().st_mtime < horizon:

@@ -215,6 +215,45 @@ def test_gc_keeps_pinned_recent_and_their_inputs(run, tmp_path):
     assert gone == {old["squares"].path, old["total"].path, new["total"].path}
 
 
+@pytest.mark.parametrize("struck", ["rename", "delete"])
+def test_a_gc_that_is_interrupted_leaves_only_trash(run, tmp_path, monkeypatch, struck):
+    """Killed after its rename or in the middle of deleting: that is no artifact any more, and the next gc ends it."""
+    artifacts, _ = run()
+    store = Store(tmp_path / "store")
+
+    def die(path, **_):
+        if struck == "delete":
+            (path / "manifest.json").unlink()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("shutil.rmtree", die)
+        with pytest.raises(KeyboardInterrupt):
+            store.remove(artifacts["numbers"].path)
+    assert store.find("numbers", artifacts["numbers"].key) is None
+    assert len(store.folders()) == 2 and not store.drafts()
+    assert [path.parent.name for path, _ in store.garbage(days=14)] == [".trash"]
+    assert run(squares={"offset": 1})[0]["numbers"].digest == artifacts["numbers"].digest
+    for path, _ in store.garbage(days=14):
+        store.remove(path)
+    assert store.garbage(days=14) == []
+
+
+def test_what_an_earlier_gc_left_half_deleted_is_no_artifact(run, tmp_path):
+    """Before there was the trash, gc renamed an artifact to .gone-<its name> beside the others."""
+    artifacts, _ = run()
+    store, numbers = Store(tmp_path / "store"), artifacts["numbers"]
+    aside = numbers.path.with_name(f".gone-{numbers.path.name}")
+    numbers.path.rename(aside)
+    (artifacts["squares"].path / ".gone-markers").mkdir()
+    aside.with_name(f".gone-{numbers.key}.partial").mkdir()
+    assert store.find("numbers", numbers.key) is None and store.drafts() == []
+    assert {path.name for path, _ in store.garbage(days=14)} == {
+        aside.name, ".gone-markers", f".gone-{numbers.key}.partial",
+    }  # fmt: skip
+    assert run(squares={"offset": 1})[0]["numbers"].digest == numbers.digest
+
+
 def test_resolve_takes_keys_names_and_stages(run, tmp_path):
     artifacts, _ = run()
     store = Store(tmp_path / "store")
