@@ -167,6 +167,8 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
     for name, planned in plan.items():
         try:
             artifacts[name] = store.find(name, planned.key)
+            if artifacts[name] is not None and not run.plan:
+                store.touch(planned.key)  # not only at its turn, which may be days away: gc must know
         except Damaged as error:
             artifacts[name], damaged[name] = None, error
     todo = _todo(run, plan, artifacts)

@@ -26,7 +26,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import psutil
 
@@ -527,6 +527,7 @@ class Store:
 
     def __init__(self, root: Path | str):
         self.root = Path(root).absolute()
+        self._nodes: dict[Path, tuple[Any, _Node]] = {}  # artifacts as gc saw them last
 
     # -- finding
 
@@ -633,8 +634,11 @@ class Store:
             pass  # a read-only store can still be read
 
     def last_used(self, artifact: Artifact) -> float:
-        path = self.root / ".used" / artifact.key
-        return path.stat().st_mtime if path.exists() else artifact.manifest["finished"]
+        return self._used(artifact.key, artifact.manifest["finished"])
+
+    def _used(self, key: str, made: float) -> float:
+        path = self.root / ".used" / key
+        return path.stat().st_mtime if path.exists() else made
 
     def pinned(self, key: str) -> bool:
         return (self.root / ".pins" / key).exists()
@@ -653,43 +657,112 @@ class Store:
         os.replace(path, aside)
         return aside
 
-    def remove(self, path: Path) -> None:
-        """Delete what ``garbage`` listed: out of sight first, so that a kill in the middle leaves no half artifact."""
-        if path.parent.name != ".trash" and not path.name.startswith(".gone-"):
-            path = self.trash(path)
+    def garbage(self, days: float, claimed: str | None = None) -> list[tuple[Path, str]]:
+        """What can go, with the reason: trash, drafts nobody works on, and artifacts nobody needs.
+
+        An artifact is needed while it is pinned, was used within ``days``, or is an input of an artifact that is needed or of
+        a draft that is kept. ``claimed``: a key whose claim the caller holds itself.
+        """
+        horizon = time.time() - days * 86400
+        found: list[tuple[Path, str]] = []
+        for pattern in TRASH:
+            found += [(path, "trash: replaced, or left by a gc that was interrupted") for path in self.root.glob(pattern)]
+        nodes = [node for path in self.folders() if (node := self._node(path)) is not None]
+        todo = [
+            node.key for node in nodes if node.damaged or self.pinned(node.key) or self._used(node.key, node.made) >= horizon
+        ]
+        for path in self.drafts():
+            key = path.name.removesuffix(".partial")
+            held = key != claimed and self.claim(path.parent.name, key).holder() is not None
+            if not held and not _changed_since(path, horizon):
+                found.append((path, f"unfinished and untouched for {days:g} days"))
+            elif (draft := read_draft(path)) is not None:
+                todo += draft["preimage"]["inputs"].values()
+            else:  # damaged, or not written yet: any artifact may be its input
+                todo += [node.key for node in nodes]
+        inputs = {node.key: node.inputs for node in nodes}
+        needed: set[str] = set()
+        while todo:
+            if (key := todo.pop()) not in needed:
+                needed.add(key)
+                todo += inputs.get(key, ())
+        for node in sorted(nodes, key=lambda node: node.made, reverse=True):
+            if node.key not in needed:
+                found.append((node.path, f"not pinned, not used for {days:g} days"))
+            else:
+                left = [node.path / name for name in WORKING if (node.path / name).exists()]
+                found += [(path, "left over by a commit that was interrupted") for path in left]
+        return found
+
+    def remove(self, path: Path, days: float) -> bool:
+        """Delete what ``garbage(days)`` listed, unless somebody works on it or has come to need it since; says whether.
+
+        Out of sight first, so that a kill in the middle leaves no half artifact.
+        """
+        stage, name = path.relative_to(self.root).parts[:2]
+        if stage != ".trash" and not path.name.startswith(".gone-"):
+            node = None if name.endswith(".partial") else self._node(self.root / stage / name)
+            key = node.key if node is not None else name.removesuffix(".partial")
+            claim = self.claim(stage, key)
+            if not claim.take():
+                return False
+            try:
+                if path not in [found for found, _ in self.garbage(days, key)]:
+                    return False
+                path = self.trash(path)
+            finally:
+                claim.release()
 
         def failed(function: Any, name: str, error: Any) -> None:
             if not issubclass(error[0], FileNotFoundError):  # another gc is faster
                 raise error[1]
 
         shutil.rmtree(path, onerror=failed)
+        return True
 
-    def garbage(self, days: float) -> list[tuple[Path, str]]:
-        """What can go, with the reason: trash, drafts nobody works on, and artifacts nobody needs.
+    def _node(self, folder: Path) -> _Node | None:
+        """What gc must know of an artifact; None where it is gone. Read once: gc looks again before each removal.
 
-        An artifact is needed while it is pinned, was used within ``days``, or is an input of one that is needed.
+        One with a damaged manifest counts as in use: while its inputs are there, it can be repaired.
         """
-        horizon = time.time() - days * 86400
-        found: list[tuple[Path, str]] = []
-        for pattern in TRASH:
-            found += [(path, "trash: replaced, or left by a gc that was interrupted") for path in self.root.glob(pattern)]
-        for path in self.drafts():
-            claim = self.claim(path.parent.name, path.name.removesuffix(".partial"))
-            if claim.holder() is None and (path / "markers").exists() and (path / "markers").stat().st_mtime < horizon:
-                found.append((path, f"unfinished and untouched for {days:g} days"))
-        artifacts = self.artifacts()
-        keep = {a.key for a in artifacts if self.pinned(a.key) or self.last_used(a) >= horizon}
-        for artifact in reversed(artifacts):  # newest first, so that inputs of kept ones are kept in one pass
-            if artifact.key in keep:
-                keep |= set(artifact.manifest["preimage"]["inputs"].values())
-        found += [(a.path, f"not pinned, not used for {days:g} days") for a in artifacts if a.key not in keep]
-        for artifact in artifacts:
-            found += [
-                (artifact.path / name, "left over by a commit that was interrupted")
-                for name in WORKING
-                if artifact.key in keep and (artifact.path / name).exists()
-            ]
-        return found
+        try:
+            stat = (folder / "manifest.json").stat()
+            stamp = stat.st_ino, stat.st_mtime_ns, stat.st_size
+        except OSError:
+            stamp = None
+        known = self._nodes.get(folder)
+        if known is None or stamp is None or known[0] != stamp:
+            try:
+                about = Artifact(folder).manifest
+            except Damaged:
+                if not folder.exists():
+                    return None
+                about = read_draft(folder) or {"key": folder.name, "preimage": {"inputs": {}}}
+            made, inputs = about.get("finished"), tuple(about["preimage"]["inputs"].values())
+            known = stamp, _Node(folder, about["key"], made or 0.0, inputs, damaged=made is None)
+            self._nodes[folder] = known
+        return known[1]
+
+
+class _Node(NamedTuple):
+    """An artifact as gc sees it."""
+
+    path: Path
+    key: str
+    made: float
+    inputs: tuple[str, ...]  # their keys
+    damaged: bool  # its manifest is
+
+
+def _changed_since(draft: Path, moment: float) -> bool:
+    """Whether anything was written in the draft since then: a part's marker, a log, a checkpoint, a file, the run's state."""
+    for folder in ("running", "state", "markers", "logs", "files"):
+        for where, _, names in os.walk(draft / folder):
+            for name in ("", *names):
+                with contextlib.suppress(FileNotFoundError):
+                    if os.stat(os.path.join(where, name)).st_mtime >= moment:
+                        return True
+    return False
 
 
 class HashCache:
