@@ -37,7 +37,7 @@ from pipeline.files import (
     json_line,
     read_jsonl,
     read_sealed,
-    sync_folder,
+    sync,
     write_atomic,
     write_json,
     write_jsonl,
@@ -412,6 +412,7 @@ class Draft(_Records):
                     os.link(source, temporary)
                 except OSError:
                     shutil.copyfile(source, temporary)
+                    sync(temporary)
                 os.replace(temporary, target)
         self.finish_part(part_key, marker)
         return True
@@ -460,6 +461,7 @@ class Draft(_Records):
             if path.is_file():
                 name = path.relative_to(self.files).as_posix()
                 files[name] = {"bytes": path.stat().st_size, "digest": hash_file(path)}
+            sync(path)  # stages just write: before the manifest vouches for a file, and state/ goes, it must be on the disk
         reasons: dict[str, int] = {}
         for reject in rejects:
             reasons[reject["reason"]] = reasons.get(reject["reason"], 0) + 1
@@ -511,7 +513,7 @@ class PartWriter:
         os.fsync(self._file.fileno())
         self._file.close()
         os.replace(self._path, self._draft.part_path(digest))
-        sync_folder(self._path.parent)
+        sync(self._path.parent)
         for row in self._rows:
             row["part"] = digest
         return {"digest": digest, "bytes": self._tar.size, "rows": self._rows}
@@ -603,7 +605,7 @@ class Store:
                 path.unlink()  # orphans: temporaries of killed workers, parts of another plan
         write_sealed(draft.path / "manifest.json", manifest)
         for folder in ("parts", "files", "."):
-            sync_folder(draft.path / folder)
+            sync(draft.path / folder)
         problems = Artifact(draft.path).verify()
         if problems:  # somebody else is at work in the same draft after all
             raise MachineError(f"{draft.path} changed while it was being committed ({problems[0]}): run the same command again")
@@ -616,7 +618,7 @@ class Store:
             if old is not None:
                 self.trash(old)
             os.replace(draft.path, target)
-            sync_folder(target.parent)
+            sync(target.parent)
             for folder in WORKING:  # only now: until the rename they are what a resume needs
                 shutil.rmtree(target / folder, ignore_errors=True)
         self.touch(draft.key)

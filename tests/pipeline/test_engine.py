@@ -20,6 +20,7 @@ from pipeline.runner import run_pipeline
 from pipeline.stage import Record
 from pipeline.store import Store
 from pipeline.sweep import plan_of
+from tests.pipeline.toy import Squares
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -207,6 +208,55 @@ def test_verify_deep_finds_planted_corruption(run):
     assert "bytes, not" in artifact.verify()[0]
 
 
+@pytest.fixture
+def synced(monkeypatch):
+    """Inodes in the order in which they were flushed to the disk."""
+    found: list[int] = []
+    fsync = os.fsync
+
+    def noting(handle):
+        found.append(os.fstat(handle).st_ino)
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", noting)
+    return found
+
+
+def test_files_are_on_the_disk_before_the_manifest_vouches_for_them(run, synced, monkeypatch):
+    def finish(self, config, inputs, draft):
+        (draft.files / "checkpoint" / "deep").mkdir(parents=True)
+        for name in ("card.txt", "checkpoint/model", "checkpoint/deep/model"):
+            (draft.files / name).write_text("what a power cut would have lost")
+
+    monkeypatch.setattr(Squares, "finish", finish)
+    artifacts, _ = run()
+    for artifact in artifacts.values():
+        manifest = synced.index((artifact.path / "manifest.json").stat().st_ino)
+        for path in [*artifact.path.glob("files/**/*"), *artifact.path.glob("parts/*.tar")]:
+            assert path.stat().st_ino in synced[:manifest], path
+        for path in (artifact.path / "files", artifact.path / "parts", artifact.path.parent):
+            assert path.stat().st_ino in synced[manifest:], path
+    assert len(list(artifacts["squares"].path.glob("files/**/*"))) == 5
+
+
+def test_a_part_that_had_to_be_copied_is_flushed_too(run, synced, monkeypatch):
+    """Where hard links are not possible; a link needs no flush, its bytes are on the disk."""
+    old, _ = run(stage="numbers")
+
+    def link(source, target):
+        raise OSError("no links here")
+
+    monkeypatch.setattr(os, "link", link)
+    grown, _ = run(stage="numbers", numbers={"n": 20})
+    shared = {p.name for p in (old["numbers"].path / "parts").iterdir()} & {
+        p.name for p in grown["numbers"].path.glob("parts/*")
+    }
+    assert shared
+    for name in shared:
+        inodes = [(artifact["numbers"].path / "parts" / name).stat().st_ino for artifact in (old, grown)]
+        assert inodes[0] != inodes[1] and inodes[1] in synced
+
+
 def test_gc_keeps_pinned_recent_and_their_inputs(run, tmp_path):
     old, _ = run()
     new, _ = run(squares={"offset": 1})
@@ -266,6 +316,16 @@ def test_gc_keeps_what_a_run_at_work_reads_however_old(run, tmp_path):
         (draft / "draft.json").write_bytes(b"damaged: it cannot say what it reads")
         assert store.garbage(days=14) == []
     assert len(store.garbage(days=14)) == 3
+
+
+def test_what_a_run_found_made_is_in_use_from_its_start_on(run, tmp_path):
+    """Not from when its turn comes, which may be weeks later."""
+    artifacts, _ = run()
+    store = Store(tmp_path / "store")
+    unused(store)
+    with pytest.raises(UserError, match="a bug"):
+        run(force="numbers", numbers={"fail": ["n003"]})
+    assert store.garbage(days=14) == []
 
 
 @contextlib.contextmanager
