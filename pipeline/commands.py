@@ -102,6 +102,8 @@ def command_show(store: Store, arguments: argparse.Namespace) -> int:
     print(f"  command   {manifest['command']}")
     dirty = " with changes" if code["dirty"] else ""
     print(f"  code      version {manifest['preimage']['version']}, commit {code['commit']}{dirty}")
+    if "others" in code:
+        print(f"  code      parts of it were made by other code: {', '.join(_short(other) for other in code['others'])}")
     for name, value in sorted(_flat(manifest["environment"]).items()):
         if name:
             print(f"  runtime   {name} = {value}")

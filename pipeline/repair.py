@@ -22,7 +22,7 @@ from pipeline.files import hash_file
 from pipeline.keys import digest_of
 from pipeline.runner import Planned, RunConfig, make_artifact, plan_stage
 from pipeline.stage import MapStage, load_system
-from pipeline.store import Artifact, Draft, HashCache, Row, Store, read_draft, record_digest
+from pipeline.store import UNKNOWN, Artifact, Draft, HashCache, Row, Store, read_draft, record_digest
 from pipeline.worker import log_file
 
 
@@ -57,6 +57,7 @@ def repair(store: Store, artifact: Artifact, workers: int | None = None, out: Ca
             draft.set_environment(origin["environment"])
         taken = 0
         if isinstance(planned.stage, MapStage):
+            draft.made_by(_codes(artifact), "what is sound was")
             for marker in sound_parts(artifact):
                 source = artifact.part_path(marker["digest"]) if marker["digest"] else artifact.path
                 taken += draft.link_part(source, marker["part_key"], marker)
@@ -80,6 +81,11 @@ def _manifest(artifact: Artifact) -> dict[str, Any]:
         return artifact.manifest
     except Damaged:
         return {}
+
+
+def _codes(artifact: Artifact) -> list[str]:
+    """Digests of the code that made it, from whichever copy is sound."""
+    return artifact.codes if _manifest(artifact) else (read_draft(artifact.path) or {}).get("codes", [UNKNOWN])
 
 
 def _origin(artifact: Artifact) -> dict[str, Any]:

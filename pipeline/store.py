@@ -51,6 +51,7 @@ SCHEMA = 2  # of manifests; from 2 on they are sealed, so that a changed byte sh
 STALE_CLAIM_S = 120.0  # another host's claim without a heartbeat for this long is taken over
 DRAFT = "draft.json"  # what is being made; stays with the artifact
 TRASH = (".trash/*", "[!.]*/.gone-*", "[!.]*/*/.gone-*")  # the last two: how an earlier gc named what it was deleting
+UNKNOWN = "unknown"  # the digest of code that nobody noted
 WORKING = ("markers", "running", "state")  # folders of a draft that its artifact does not keep
 
 
@@ -161,6 +162,12 @@ class Artifact(_Records):
     @property
     def stage(self) -> str:
         return self.manifest["preimage"]["stage"]
+
+    @property
+    def codes(self) -> list[str]:
+        """Digests of the code that made it: first that of the run that ended it, then others whose parts that took over."""
+        code = self.manifest["code"]
+        return [code["digest"], *code.get("others", [])]
 
     @property
     def digest(self) -> str:
@@ -349,13 +356,30 @@ class Draft(_Records):
             for path in self.path.glob(pattern):
                 path.unlink(missing_ok=True)
 
+    def describe(self, **facts: Any) -> None:
+        write_sealed(self.path / DRAFT, {**(read_draft(self.path) or {}), **facts})
+
     # -- environment: runtime choices that one artifact must not mix
 
     def environment(self) -> dict[str, Any] | None:
         return (read_draft(self.path) or {}).get("environment")
 
     def set_environment(self, environment: Mapping[str, Any]) -> None:
-        write_sealed(self.path / DRAFT, {**(read_draft(self.path) or {}), "environment": environment})
+        self.describe(environment=environment)
+
+    # -- code: digests of all that made what is in here; one artifact may mix them, and its manifest says so
+
+    def codes(self) -> list[str]:
+        return (read_draft(self.path) or {}).get("codes", [UNKNOWN])
+
+    def made_by(self, codes: Iterable[str], what: str) -> None:
+        """Remember who made ``what``, which the draft takes over."""
+        known = self.codes()
+        new = sorted(set(codes) - set(known))
+        if new:
+            self.describe(codes=known + new)
+            whose = "code that nobody noted" if new == [UNKNOWN] else "other code of the same version"
+            self.log(f"   note: {what} made by {whose}")
 
     # -- parts
 
@@ -579,13 +603,36 @@ class Store:
     # -- making
 
     def draft(
-        self, stage: str, key: str, preimage: Mapping[str, Any], out: Any = print, origin: Mapping[str, Any] | None = None
+        self,
+        stage: str,
+        key: str,
+        preimage: Mapping[str, Any],
+        out: Any = print,
+        origin: Mapping[str, Any] | None = None,
+        purpose: str = "make",
+        code: str = UNKNOWN,
     ) -> Draft:
-        """A new draft, or the one that an interrupted run left. ``origin``: what it takes to make it anew (system, config)."""
+        """A new draft, or the one that an interrupted run left.
+
+        ``origin``: what it takes to make it anew (system, config). ``purpose``: make, force or repair; what force did not begin
+        itself it sets aside. ``code``: the digest of the code at work.
+        """
         path = self.draft_path(stage, key)
+        before = read_draft(path)
+        begun = any(any((path / folder).glob("[!.]*")) for folder in ("markers", "state"))
+        if begun and purpose == "force" and (before or {}).get("purpose") != "force":
+            aside = self.trash(path)
+            out(f"   note: force takes nothing of what an earlier run had finished; that is in {aside} until gc deletes it")
+            before, begun = None, False
         draft = Draft(path, stage, key, preimage, out)
-        if read_draft(path) is None:
-            write_sealed(path / DRAFT, {"key": key, "preimage": draft.preimage, "started": time.time(), **(origin or {})})
+        about = {"key": key, "preimage": draft.preimage, "started": time.time(), **(origin or {})} if before is None else before
+        others = [other for other in about.get("codes", [UNKNOWN]) if other != code] if begun else []
+        if others and code != UNKNOWN:
+            whose = "code that nobody noted" if others == [UNKNOWN] else "other code of the same version"
+            out(f"   note: what is finished of {stage} was made by {whose}; it is kept (to begin anew, delete {path})")
+        facts = {"purpose": purpose, "codes": [*others, code]}
+        if before is None or not facts.items() <= before.items():
+            write_sealed(path / DRAFT, {**about, **facts})
         return draft
 
     def draft_path(self, stage: str, key: str) -> Path:
