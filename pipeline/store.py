@@ -13,6 +13,7 @@ run continues.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import json
@@ -63,6 +64,18 @@ def record_digest(members: Mapping[str, bytes]) -> str:
         digest.update(f"{len(name)}:{name}:{len(data)}:".encode())
         digest.update(data)
     return digest.hexdigest()
+
+
+def is_sound(path: Path, digest: str) -> bool:
+    """Whether the file is there, can be read and has that digest."""
+    try:
+        return hash_file(path) == digest
+    except OSError:
+        return False
+
+
+def unreadable(error: OSError) -> str:
+    return f"cannot be read ({error.strerror or error})"
 
 
 class _Records:
@@ -120,6 +133,10 @@ class _Records:
                         members[name] = file.read(size)
         except FileNotFoundError:
             raise self.damaged(f"parts/{path.name} is missing") from None
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            raise self.damaged(f"parts/{path.name} {unreadable(error)}") from None
         record = Record(row.id, members)
         cut = any(len(data) != row.members[name][1] for name, data in members.items())
         if cut or (only is None and record_digest(members) != row.digest):
@@ -174,10 +191,9 @@ class Artifact(_Records):
         return self.manifest["outputs"]["digest"]
 
     def _sound(self, name: str) -> Path:
-        path = self.path / name
-        if not path.is_file() or hash_file(path) != self.manifest["outputs"]["listings"][name]:
-            raise self.damaged(f"{name} is missing or changed")
-        return path
+        if trouble := self._trouble(name, None, self.manifest["outputs"]["listings"][name]):
+            raise self.damaged(trouble)
+        return self.path / name
 
     @cached_property
     def _rows(self) -> Listing:
@@ -196,31 +212,36 @@ class Artifact(_Records):
             raise UserError(f"{self.path} has no file {name}")
         return path
 
+    def _trouble(self, name: str, size: int | None, digest: str | None, items: int | None = None) -> str:
+        """What is wrong with one file, empty if nothing is; None: not looked at."""
+        path = self.path / name
+        try:
+            if not path.is_file():
+                return f"{name} is missing" + (f" ({items} items)" if items is not None else "")
+            found = path.stat().st_size
+            if size is not None and found != size:
+                return f"{name} has {found} bytes, not {size}"
+            if digest is not None and hash_file(path) != digest:
+                return f"{name} does not hash to {'its name' if digest in name else digest[:12]}"
+        except OSError as error:
+            return f"{name} {unreadable(error)}"
+        return ""
+
     def verify(self, deep: bool = False) -> list[str]:
         """What is wrong with it, as lines; ``deep`` reads every byte. Empty means sound."""
-        problems = []
+        problems: list[str] = []
         try:
             outputs = self.manifest["outputs"]
         except Damaged as error:
             return [str(error).removeprefix(f"{self.path}: ").partition(";")[0]]
         for part in outputs["parts"]:
-            path = self.part_path(part["digest"])
-            if not path.is_file():
-                problems.append(f"parts/{path.name} is missing ({len(part['items'])} items)")
-            elif path.stat().st_size != part["bytes"]:
-                problems.append(f"parts/{path.name} has {path.stat().st_size} bytes, not {part['bytes']}")
-            elif deep and hash_file(path) != part["digest"]:
-                problems.append(f"parts/{path.name} does not hash to its name")
+            name = f"parts/{part['digest']}.tar"
+            problems.append(self._trouble(name, part["bytes"], part["digest"] if deep else None, len(part["items"])))
         for name, entry in outputs["files"].items():
-            path = self.path / "files" / name
-            if not path.is_file() or path.stat().st_size != entry["bytes"]:
-                problems.append(f"files/{name} is missing or has another size than {entry['bytes']} bytes")
-            elif deep and hash_file(path) != entry["digest"]:
-                problems.append(f"files/{name} does not hash to {entry['digest'][:12]}")
+            problems.append(self._trouble(f"files/{name}", entry["bytes"], entry["digest"] if deep else None))
         for name, expected in outputs["listings"].items():
-            path = self.path / name
-            if not path.is_file() or hash_file(path) != expected:
-                problems.append(f"{name} is missing or changed")
+            problems.append(self._trouble(name, None, expected))
+        problems = [problem for problem in problems if problem]
         if digest_of(self.manifest["preimage"]) != self.key:
             problems.append("manifest.json: the key is not the hash of its preimage")
         if self.manifest.get("schema", 1) > 1 and read_draft(self.path) is None:
@@ -407,7 +428,7 @@ class Draft(_Records):
                 return None, False
             if marker is not None:
                 del marker["rows"]  # there may be millions
-            if marker is None or marker["digest"] is None or hash_file(self.part_path(marker["digest"])) == marker["digest"]:
+            if marker is None or marker["digest"] is None or is_sound(self.part_path(marker["digest"]), marker["digest"]):
                 return marker, False
             return None, True
 
@@ -428,9 +449,9 @@ class Draft(_Records):
         """
         if marker["digest"] is not None:
             target = self.part_path(marker["digest"])
-            if not source.is_file() or hash_file(source) != marker["digest"]:
+            if not is_sound(source, marker["digest"]):
                 return False
-            if not target.exists():
+            if not target.exists() or not target.samefile(source):  # of what lies there already nobody knows that it is sound
                 temporary = target.with_name(f".{uuid.uuid4().hex[:8]}.tmp")
                 try:
                     os.link(source, temporary)
