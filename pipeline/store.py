@@ -614,12 +614,21 @@ class Store:
         if not stage and (newest := self.artifacts(reference) if reference.isidentifier() else []):
             return newest[-1]
         token = rest.rpartition("-")[2]
-        found = [a for a in self.artifacts(stage or None) if len(token) >= 4 and a.key.startswith(token)]
+        found = [Artifact(path) for path in self.folders(stage or None) if len(token) >= 4 and self._is_key(token, path)]
         if len(found) == 1:
             return found[0]
         if found:
             raise UserError(f"{reference!r} is the beginning of {len(found)} keys: give more letters")
         raise UserError(f"no artifact {reference!r} in {self.root}: `lightmill ls` lists what is there")
+
+    @staticmethod
+    def _is_key(token: str, folder: Path) -> bool:
+        """Whether the artifact's key begins so. Its folder has twelve letters of it, which is all there is if it is damaged."""
+        if not folder.name[-12:].startswith(token[:12]):
+            return False
+        with contextlib.suppress(Damaged):
+            return Artifact(folder).key.startswith(token)
+        return True
 
     # -- making
 

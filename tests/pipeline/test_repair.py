@@ -141,6 +141,39 @@ def test_repair_says_so_where_the_result_is_another(run, tmp_path):
     assert any("DIFFERENT from before" in line and "later stages still hold" in line for line in lines)
 
 
+@pytest.mark.parametrize("copies", ["manifest.json", "manifest.json draft.json"])
+def test_an_artifact_with_a_damaged_manifest_is_found_by_its_key_and_its_name(run, tmp_path, copies):
+    artifacts, _ = run()
+    store, numbers = Store(tmp_path / "store"), artifacts["numbers"]
+    key, name = numbers.key, numbers.path.name
+    for copy in copies.split():
+        flip(numbers.path / copy)
+    for reference in (
+        key,
+        key[:12],
+        key[:6],
+        name,
+        f"numbers/{name}",
+        f"numbers/{key[:12]}",
+        f"numbers/{key}",
+        str(numbers.path),
+    ):
+        assert store.resolve(reference).path == numbers.path, reference
+    for reference in (key[:4] + "zzzz", f"squares/{key}", key[1:13]):
+        with pytest.raises(UserError, match="no artifact"):
+            store.resolve(reference)
+    other = artifacts["squares"].key  # of a readable one all letters count
+    with pytest.raises(UserError, match="no artifact"):
+        store.resolve(other[:20] + "zz")
+    parsed = parser().parse_args(["repair", key, "--workers", "0", "--store", str(store.root)])
+    if copies == "manifest.json":
+        assert parsed.function(parsed) == 0
+        assert store.resolve("numbers").digest == numbers.digest
+    else:
+        with pytest.raises(Damaged, match="delete the folder"):
+            parsed.function(parsed)
+
+
 @pytest.fixture
 def unreadable(monkeypatch):
     """unreadable(path, ...): from here on the disk cannot read these files, as long as they are not made anew."""
