@@ -14,7 +14,8 @@ import pytest
 
 from pipeline import commands
 from pipeline.errors import Damaged, UserError
-from pipeline.repair import repair
+from pipeline.listing import Row
+from pipeline.repair import repair, sound_parts
 from pipeline.runner import run_pipeline
 from pipeline.store import Artifact, Store
 
@@ -172,6 +173,25 @@ def test_an_artifact_with_a_damaged_manifest_is_found_by_its_key_and_its_name(ru
     else:
         with pytest.raises(Damaged, match="delete the folder"):
             parsed.function(parsed)
+
+
+def test_repair_reads_the_listing_part_by_part(run, tmp_path, monkeypatch):
+    """There may be millions of rows: no more than a part's are held, wherever the listing has its damage."""
+    artifacts, _ = run(numbers={"n": 40})
+    artifact = artifacts["squares"]
+    computed(tmp_path)
+    path = artifact.path / "items.jsonl"
+    lines = path.read_text().splitlines()
+    for number in (4, len(lines) - 1):
+        lines[number] = "?"
+    path.write_text("\n".join(lines) + "\n")
+    parsed: list[Row] = []
+    monkeypatch.setattr(Row, "from_json", lambda line, parse=Row.from_json: parsed.append(parse(line)) or parsed[-1])
+    assert len(next(sound_parts(Artifact(artifact.path)))["rows"]) == 3 and len(parsed) == 4
+    mend(tmp_path, artifact)
+    parts = [part["items"] for part in artifact.manifest["outputs"]["parts"]]
+    assert computed(tmp_path) == sorted([*parts[1], *parts[-1]])
+    assert Store(tmp_path / "store").resolve("squares").verify(deep=True) == []
 
 
 @pytest.fixture
