@@ -155,7 +155,7 @@ class Artifact(_Records):
         self.path = Path(path)
 
     def __repr__(self) -> str:
-        return f"Artifact({self.stage}/{self.path.name})"
+        return f"Artifact({self.path.parent.name}/{self.path.name})"
 
     def __reduce__(self) -> tuple[type, tuple[Path]]:
         return Artifact, (self.path,)  # workers reopen by path: cheap to send
@@ -745,7 +745,7 @@ class Store:
         horizon = time.time() - days * 86400
         found: list[tuple[Path, str]] = []
         for pattern in TRASH:
-            found += [(path, "trash: replaced, or left by a gc that was interrupted") for path in self.root.glob(pattern)]
+            found += [(path, "trash: replaced or set aside, or left by an interrupted gc") for path in self.root.glob(pattern)]
         nodes = [node for path in self.folders() if (node := self._node(path)) is not None]
         todo = [
             node.key for node in nodes if node.damaged or self.pinned(node.key) or self._used(node.key, node.made) >= horizon

@@ -160,6 +160,7 @@ def test_an_artifact_with_a_damaged_manifest_is_found_by_its_key_and_its_name(ru
         str(numbers.path),
     ):
         assert store.resolve(reference).path == numbers.path, reference
+    assert repr(store.resolve(key)) == f"Artifact(numbers/{name})"
     for reference in (key[:4] + "zzzz", f"squares/{key}", key[1:13]):
         with pytest.raises(UserError, match="no artifact"):
             store.resolve(reference)
