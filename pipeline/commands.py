@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import os
 import re
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -101,6 +102,8 @@ def command_show(store: Store, arguments: argparse.Namespace) -> int:
     print(f"  command   {manifest['command']}")
     dirty = " with changes" if code["dirty"] else ""
     print(f"  code      version {manifest['preimage']['version']}, commit {code['commit']}{dirty}")
+    if "others" in code:
+        print(f"  code      parts of it were made by other code: {', '.join(_short(other) for other in code['others'])}")
     for name, value in sorted(_flat(manifest["environment"]).items()):
         if name:
             print(f"  runtime   {name} = {value}")
@@ -243,16 +246,25 @@ def command_gc(store: Store, arguments: argparse.Namespace) -> int:
     found = store.garbage(arguments.days)
     total = 0
     for path, reason in found:
-        count = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-        total += count
+        count = _bytes(path)
         print(f"{'deleting' if arguments.delete else 'would delete'} {path.relative_to(store.root)}  {size(count)}  {reason}")
-        if arguments.delete:
-            aside = path.with_name(f".gone-{path.name}")
-            path.rename(aside)  # out of sight at once: a kill in the middle leaves no half artifact
-            shutil.rmtree(aside)
+        if arguments.delete and not store.remove(path, arguments.days):
+            print("  kept: somebody works on it or has come to need it since")
+            count = 0
+        total += count
     verb = "freed" if arguments.delete else "to free; nothing was deleted, add --delete"
     print(f"{len(found)} entries, {size(total)} {verb}")
     return 0
+
+
+def _bytes(folder: Path) -> int:
+    """Of all files in it; another gc may be deleting them."""
+    total = 0
+    for where, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                total += os.lstat(os.path.join(where, name)).st_size
+    return total
 
 
 def command_pin(store: Store, arguments: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ bear them out, so any file of the artifact may be the damaged one: what it takes
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import shutil
 import tarfile
@@ -18,11 +19,10 @@ from typing import Any
 
 from pipeline.config import parse
 from pipeline.errors import Damaged, UserError
-from pipeline.files import hash_file
 from pipeline.keys import digest_of
 from pipeline.runner import Planned, RunConfig, make_artifact, plan_stage
 from pipeline.stage import MapStage, load_system
-from pipeline.store import Artifact, Draft, HashCache, Row, Store, read_draft, record_digest
+from pipeline.store import UNKNOWN, Artifact, Draft, HashCache, Row, Store, is_sound, read_draft, record_digest
 from pipeline.worker import log_file
 
 
@@ -57,6 +57,7 @@ def repair(store: Store, artifact: Artifact, workers: int | None = None, out: Ca
             draft.set_environment(origin["environment"])
         taken = 0
         if isinstance(planned.stage, MapStage):
+            draft.made_by(_codes(artifact), "what is sound was")
             for marker in sound_parts(artifact):
                 source = artifact.part_path(marker["digest"]) if marker["digest"] else artifact.path
                 taken += draft.link_part(source, marker["part_key"], marker)
@@ -80,6 +81,11 @@ def _manifest(artifact: Artifact) -> dict[str, Any]:
         return artifact.manifest
     except Damaged:
         return {}
+
+
+def _codes(artifact: Artifact) -> list[str]:
+    """Digests of the code that made it, from whichever copy is sound."""
+    return artifact.codes if _manifest(artifact) else (read_draft(artifact.path) or {}).get("codes", [UNKNOWN])
 
 
 def _origin(artifact: Artifact) -> dict[str, Any]:
@@ -114,29 +120,30 @@ def _planned(store: Store, name: str, origin: Mapping[str, Any]) -> Planned:
 
 def sound_parts(artifact: Artifact) -> Iterator[dict[str, Any]]:
     """Markers of the parts whose tar, rows and rejects are what was written, whatever else is damaged."""
-    rows: dict[str, list[Row]] = {}
-    for line in _json_lines(artifact.path / "items.jsonl"):
-        with contextlib.suppress(KeyError, TypeError, ValueError, AttributeError):
-            row = Row.from_json(line)
-            rows.setdefault(row.part, []).append(row)
     outputs = _manifest(artifact).get("outputs")
-    if outputs is None:  # then rejects cannot be checked, and parts that had any are computed again
-        for digest, found in rows.items():
-            items = sorted({row.item: row.item_key for row in found}.items())
-            yield from _part(artifact, {"digest": digest, "group": found[0].group}, items, found, [])
-        return
-    try:
-        rejects = {reject["item"]: reject for reject in artifact.rejects() if not reject.get("whole")}
-    except Damaged:
-        rejects = {}
-    for part in outputs["parts"] + [{**part, "digest": None, "bytes": 0} for part in outputs["empty_parts"]]:
-        found = rows.get(part["digest"], [])
-        keys = {row.item: row.item_key for row in found} | {
-            item: rejects[item]["item_key"] for item in part["items"] if item in rejects
-        }
+    told = {part["digest"]: part for part in outputs["parts"]} if outputs else {}
+    rejects: dict[str, dict[str, Any]] = {}
+    if outputs:  # without, rejects cannot be checked, and parts that had any are computed again
+        with contextlib.suppress(Damaged):
+            rejects = {reject["item"]: reject for reject in artifact.rejects() if not reject.get("whole")}
+
+    def checked(part: Mapping[str, Any], rows: list[Row]) -> Iterator[dict[str, Any]]:
+        keys = {row.item: row.item_key for row in rows}
+        keys |= {item: rejects[item]["item_key"] for item in part["items"] if item in rejects}
         if set(keys) == set(part["items"]):
             items = [(item, keys[item]) for item in part["items"]]
-            yield from _part(artifact, part, items, found, [rejects[item] for item in part["items"] if item in rejects])
+            yield from _part(artifact, part, items, rows, [rejects[item] for item in part["items"] if item in rejects])
+
+    # a part's rows are neighbours, and no more of them are in memory: there may be millions
+    for digest, group in itertools.groupby(_rows(artifact.path / "items.jsonl"), key=lambda row: row.part):
+        rows = list(group)
+        if outputs is None:
+            items = sorted({row.item for row in rows})
+            yield from checked({"digest": digest, "group": rows[0].group, "items": items}, rows)
+        elif digest in told:
+            yield from checked(told[digest], rows)
+    for part in outputs["empty_parts"] if outputs else ():
+        yield from checked({**part, "digest": None, "bytes": 0}, [])
 
 
 def _part(
@@ -149,14 +156,12 @@ def _part(
     size = 0
     if part["digest"] is not None:
         path = artifact.part_path(part["digest"])
-        if not path.is_file() or hash_file(path) != part["digest"]:
-            return
-        size = path.stat().st_size
         rows = sorted(rows, key=lambda row: min((offset for offset, _ in row.members.values()), default=0))
-        with tarfile.open(path) as tar:
-            held = {member.name: (member.offset_data, member.size) for member in tar.getmembers()}
-        told = {f"{row.id}.{name}": place for row in rows for name, place in row.members.items()}
-        if held != told or sum(len(row.members) for row in rows) != len(held) or not _records_match(path, rows):
+        try:
+            if not is_sound(path, part["digest"]) or not _rows_match(path, rows):
+                return
+            size = path.stat().st_size
+        except OSError:  # a disk that reads it once and not again
             return
     yield {
         "digest": part["digest"],
@@ -169,7 +174,13 @@ def _part(
     }
 
 
-def _records_match(path: Path, rows: list[Row]) -> bool:
+def _rows_match(path: Path, rows: list[Row]) -> bool:
+    """Whether the rows say what the tar holds: its members, all of them, and the digests of its records."""
+    with tarfile.open(path) as tar:
+        held = {member.name: (member.offset_data, member.size) for member in tar.getmembers()}
+    told = {f"{row.id}.{name}": place for row in rows for name, place in row.members.items()}
+    if held != told or sum(len(row.members) for row in rows) != len(held):
+        return False
     with open(path, "rb") as file:
         for row in rows:
             members = {}
@@ -181,12 +192,12 @@ def _records_match(path: Path, rows: list[Row]) -> bool:
     return True
 
 
-def _json_lines(path: Path) -> Iterator[Any]:
-    """Those lines of the file that are still JSON."""
-    try:
-        data = path.read_bytes()
-    except OSError:
-        return
-    for line in data.split(b"\n"):
-        with contextlib.suppress(ValueError):
-            yield json.loads(line)
+def _rows(path: Path) -> Iterator[Row]:
+    """The lines of the listing that are still rows, as far as it can be read."""
+    with contextlib.suppress(OSError), open(path, "rb") as file:
+        for line in file:
+            try:
+                row = Row.from_json(json.loads(line))
+            except (KeyError, TypeError, ValueError, AttributeError):
+                continue
+            yield row

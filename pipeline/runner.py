@@ -167,6 +167,8 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
     for name, planned in plan.items():
         try:
             artifacts[name] = store.find(name, planned.key)
+            if artifacts[name] is not None and not run.plan:
+                store.touch(planned.key)  # not only at its turn, which may be days away: gc must know
         except Damaged as error:
             artifacts[name], damaged[name] = None, error
     todo = _todo(run, plan, artifacts)
@@ -193,7 +195,7 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
             elif artifact is not None:
                 store.touch(artifact.key)
                 out(f"{_label(system, name)} up to date {_describe(artifact)}")
-                if artifact.manifest["code"]["digest"] != code_digest(system, name):
+                if artifact.codes != [code_digest(system, name)]:
                     out(f"   note: the code of {name} has changed since, its version has not (force={name} recomputes)")
             else:
                 out(f"{_label(system, name)} not needed key {planned.key[:12]}")
@@ -258,9 +260,9 @@ def make_artifact(
     out: Callable[[str], None],
     plan: Sequence[str] = (),
     cluster: Cluster | None = None,
-    adopt: Callable[[Draft], None] = lambda draft: None,
+    adopt: Callable[[Draft], None] | None = None,
 ) -> Artifact:
-    """Compute one artifact and commit it. ``plan``: the stages of the whole run, for its state; ``adopt`` fills the draft."""
+    """Compute one artifact and commit it. ``plan``: the whole run's stages, for its state; ``adopt`` fills a repair's draft."""
     name, key = planned.name, planned.key
     forced = name in run.force
     claim = store.claim(name, key)
@@ -278,12 +280,15 @@ def make_artifact(
             out(text)
 
         origin = {"system": run.system, "config": planned.config.model_dump(mode="json")}
-        draft = store.draft(name, key, planned.preimage, say, origin)
+        code = code_digest(system, name)
+        purpose = "repair" if adopt is not None else "force" if forced else "make"
+        draft = store.draft(name, key, planned.preimage, say, origin, purpose, code)
         draft.sweep()
         state = RunState(draft.path, command=shlex.join(command), plan=list(plan))
         started = time.time()
         old_digest = _digest_of(store, name, key)
-        adopt(draft)
+        if adopt is not None:
+            adopt(draft)
         environment = draft.environment()
         if cluster is not None and isinstance(planned.stage, MapStage):
             environment = cluster.environment(run.system, name, planned.config, environment)
@@ -298,13 +303,14 @@ def make_artifact(
             out(f"{_label(system, name)} running    {planned.stage.slug(planned.config)}-{key[:12]}")
             products = planned.stage.run(planned.config, inputs, draft)
             draft.use_parts([])
+        others = [other for other in draft.codes() if other != code]
         manifest = {
             "schema": SCHEMA,
             "key": key,
             "preimage": planned.preimage,
             "base_key": base_key(planned),
             **origin,
-            "code": {"digest": code_digest(system, name), **commit()},
+            "code": {"digest": code, **commit(), **({"others": others} if others else {})},
             "environment": environment,
             "machine": machine(system.packages),
             "outputs": draft.outputs(products),
@@ -398,7 +404,7 @@ def _run_map(
     if len({item.id for item in items}) != len(items):
         raise AssertionError(f"{planned.name} lists an item twice")
     keys = item_keys(planned, items, inputs)
-    donors = {} if forced else _donations(planned, store, environment, keys)
+    donors = {} if forced else _donations(planned, store, environment, keys, draft)
     parts: dict[str, tuple[str, tuple[Item, ...], tuple[str, ...]]] = {}
     for group, indices in _parts(items, keys, stage.part_size(config, inputs)):
         part_item_keys = tuple(keys[index] for index in indices)
@@ -499,10 +505,13 @@ def _check_rejects(planned: Planned, stage: MapStage, draft: Draft, total: int) 
         )
 
 
-def _donations(planned: Planned, store: Store, environment: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Reuse]:
+def _donations(
+    planned: Planned, store: Store, environment: Mapping[str, Any], keys: Sequence[str], draft: Draft
+) -> dict[str, Reuse]:
     """Item key -> where an earlier artifact of the same stage holds that item."""
     base = base_key(planned)
     found: dict[str, Reuse] = {}
+    codes: dict[Path | None, list[str]] = {None: []}
     wanted: set[str] = set()
     for artifact in store.artifacts(planned.name):
         manifest = artifact.manifest
@@ -513,12 +522,17 @@ def _donations(planned: Planned, store: Store, environment: Mapping[str, Any], k
         except Damaged:  # it gives nothing, and is no input of ours
             continue
         wanted = wanted or set(keys)
+        codes[artifact.path] = artifact.codes
         for item_key, rows in itertools.groupby(artifact.rows(), key=lambda row: row.item_key):  # an item's rows are neighbours
             if item_key in wanted:
                 found[item_key] = Reuse(artifact.path, tuple(row.id for row in rows))
         for reject in artifact.rejects():
             if reject.get("item_key") in wanted and not reject.get("machine"):
                 found[reject["item_key"]] = Reuse(reject=reject)
+    givers = {reuse.artifact for reuse in found.values()}
+    draft.made_by(
+        itertools.chain.from_iterable(codes[path] for path in givers), "what is taken over from earlier artifacts was"
+    )
     return found
 
 

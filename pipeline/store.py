@@ -13,6 +13,7 @@ run continues.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import json
@@ -26,7 +27,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import psutil
 
@@ -37,7 +38,7 @@ from pipeline.files import (
     json_line,
     read_jsonl,
     read_sealed,
-    sync_folder,
+    sync,
     write_atomic,
     write_json,
     write_jsonl,
@@ -50,6 +51,8 @@ from pipeline.stage import Record
 SCHEMA = 2  # of manifests; from 2 on they are sealed, so that a changed byte shows
 STALE_CLAIM_S = 120.0  # another host's claim without a heartbeat for this long is taken over
 DRAFT = "draft.json"  # what is being made; stays with the artifact
+TRASH = (".trash/*", "[!.]*/.gone-*", "[!.]*/*/.gone-*")  # the last two: how an earlier gc named what it was deleting
+UNKNOWN = "unknown"  # the digest of code that nobody noted
 WORKING = ("markers", "running", "state")  # folders of a draft that its artifact does not keep
 
 
@@ -61,6 +64,18 @@ def record_digest(members: Mapping[str, bytes]) -> str:
         digest.update(f"{len(name)}:{name}:{len(data)}:".encode())
         digest.update(data)
     return digest.hexdigest()
+
+
+def is_sound(path: Path, digest: str) -> bool:
+    """Whether the file is there, can be read and has that digest."""
+    try:
+        return hash_file(path) == digest
+    except OSError:
+        return False
+
+
+def unreadable(error: OSError) -> str:
+    return f"cannot be read ({error.strerror or error})"
 
 
 class _Records:
@@ -118,6 +133,10 @@ class _Records:
                         members[name] = file.read(size)
         except FileNotFoundError:
             raise self.damaged(f"parts/{path.name} is missing") from None
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            raise self.damaged(f"parts/{path.name} {unreadable(error)}") from None
         record = Record(row.id, members)
         cut = any(len(data) != row.members[name][1] for name, data in members.items())
         if cut or (only is None and record_digest(members) != row.digest):
@@ -136,7 +155,7 @@ class Artifact(_Records):
         self.path = Path(path)
 
     def __repr__(self) -> str:
-        return f"Artifact({self.stage}/{self.path.name})"
+        return f"Artifact({self.path.parent.name}/{self.path.name})"
 
     def __reduce__(self) -> tuple[type, tuple[Path]]:
         return Artifact, (self.path,)  # workers reopen by path: cheap to send
@@ -162,14 +181,19 @@ class Artifact(_Records):
         return self.manifest["preimage"]["stage"]
 
     @property
+    def codes(self) -> list[str]:
+        """Digests of the code that made it: first that of the run that ended it, then others whose parts that took over."""
+        code = self.manifest["code"]
+        return [code["digest"], *code.get("others", [])]
+
+    @property
     def digest(self) -> str:
         return self.manifest["outputs"]["digest"]
 
     def _sound(self, name: str) -> Path:
-        path = self.path / name
-        if not path.is_file() or hash_file(path) != self.manifest["outputs"]["listings"][name]:
-            raise self.damaged(f"{name} is missing or changed")
-        return path
+        if trouble := self._trouble(name, None, self.manifest["outputs"]["listings"][name]):
+            raise self.damaged(trouble)
+        return self.path / name
 
     @cached_property
     def _rows(self) -> Listing:
@@ -188,31 +212,36 @@ class Artifact(_Records):
             raise UserError(f"{self.path} has no file {name}")
         return path
 
+    def _trouble(self, name: str, size: int | None, digest: str | None, items: int | None = None) -> str:
+        """What is wrong with one file, empty if nothing is; None: not looked at."""
+        path = self.path / name
+        try:
+            if not path.is_file():
+                return f"{name} is missing" + (f" ({items} items)" if items is not None else "")
+            found = path.stat().st_size
+            if size is not None and found != size:
+                return f"{name} has {found} bytes, not {size}"
+            if digest is not None and hash_file(path) != digest:
+                return f"{name} does not hash to {'its name' if digest in name else digest[:12]}"
+        except OSError as error:
+            return f"{name} {unreadable(error)}"
+        return ""
+
     def verify(self, deep: bool = False) -> list[str]:
         """What is wrong with it, as lines; ``deep`` reads every byte. Empty means sound."""
-        problems = []
+        problems: list[str] = []
         try:
             outputs = self.manifest["outputs"]
         except Damaged as error:
             return [str(error).removeprefix(f"{self.path}: ").partition(";")[0]]
         for part in outputs["parts"]:
-            path = self.part_path(part["digest"])
-            if not path.is_file():
-                problems.append(f"parts/{path.name} is missing ({len(part['items'])} items)")
-            elif path.stat().st_size != part["bytes"]:
-                problems.append(f"parts/{path.name} has {path.stat().st_size} bytes, not {part['bytes']}")
-            elif deep and hash_file(path) != part["digest"]:
-                problems.append(f"parts/{path.name} does not hash to its name")
+            name = f"parts/{part['digest']}.tar"
+            problems.append(self._trouble(name, part["bytes"], part["digest"] if deep else None, len(part["items"])))
         for name, entry in outputs["files"].items():
-            path = self.path / "files" / name
-            if not path.is_file() or path.stat().st_size != entry["bytes"]:
-                problems.append(f"files/{name} is missing or has another size than {entry['bytes']} bytes")
-            elif deep and hash_file(path) != entry["digest"]:
-                problems.append(f"files/{name} does not hash to {entry['digest'][:12]}")
+            problems.append(self._trouble(f"files/{name}", entry["bytes"], entry["digest"] if deep else None))
         for name, expected in outputs["listings"].items():
-            path = self.path / name
-            if not path.is_file() or hash_file(path) != expected:
-                problems.append(f"{name} is missing or changed")
+            problems.append(self._trouble(name, None, expected))
+        problems = [problem for problem in problems if problem]
         if digest_of(self.manifest["preimage"]) != self.key:
             problems.append("manifest.json: the key is not the hash of its preimage")
         if self.manifest.get("schema", 1) > 1 and read_draft(self.path) is None:
@@ -348,13 +377,30 @@ class Draft(_Records):
             for path in self.path.glob(pattern):
                 path.unlink(missing_ok=True)
 
+    def describe(self, **facts: Any) -> None:
+        write_sealed(self.path / DRAFT, {**(read_draft(self.path) or {}), **facts})
+
     # -- environment: runtime choices that one artifact must not mix
 
     def environment(self) -> dict[str, Any] | None:
         return (read_draft(self.path) or {}).get("environment")
 
     def set_environment(self, environment: Mapping[str, Any]) -> None:
-        write_sealed(self.path / DRAFT, {**(read_draft(self.path) or {}), "environment": environment})
+        self.describe(environment=environment)
+
+    # -- code: digests of all that made what is in here; one artifact may mix them, and its manifest says so
+
+    def codes(self) -> list[str]:
+        return (read_draft(self.path) or {}).get("codes", [UNKNOWN])
+
+    def made_by(self, codes: Iterable[str], what: str) -> None:
+        """Remember who made ``what``, which the draft takes over."""
+        known = self.codes()
+        new = sorted(set(codes) - set(known))
+        if new:
+            self.describe(codes=known + new)
+            whose = "code that nobody noted" if new == [UNKNOWN] else "other code of the same version"
+            self.log(f"   note: {what} made by {whose}")
 
     # -- parts
 
@@ -382,7 +428,7 @@ class Draft(_Records):
                 return None, False
             if marker is not None:
                 del marker["rows"]  # there may be millions
-            if marker is None or marker["digest"] is None or hash_file(self.part_path(marker["digest"])) == marker["digest"]:
+            if marker is None or marker["digest"] is None or is_sound(self.part_path(marker["digest"]), marker["digest"]):
                 return marker, False
             return None, True
 
@@ -403,14 +449,15 @@ class Draft(_Records):
         """
         if marker["digest"] is not None:
             target = self.part_path(marker["digest"])
-            if not source.is_file() or hash_file(source) != marker["digest"]:
+            if not is_sound(source, marker["digest"]):
                 return False
-            if not target.exists():
+            if not target.exists() or not target.samefile(source):  # of what lies there already nobody knows that it is sound
                 temporary = target.with_name(f".{uuid.uuid4().hex[:8]}.tmp")
                 try:
                     os.link(source, temporary)
                 except OSError:
                     shutil.copyfile(source, temporary)
+                    sync(temporary)
                 os.replace(temporary, target)
         self.finish_part(part_key, marker)
         return True
@@ -459,6 +506,7 @@ class Draft(_Records):
             if path.is_file():
                 name = path.relative_to(self.files).as_posix()
                 files[name] = {"bytes": path.stat().st_size, "digest": hash_file(path)}
+            sync(path)  # stages just write: before the manifest vouches for a file, and state/ goes, it must be on the disk
         reasons: dict[str, int] = {}
         for reject in rejects:
             reasons[reject["reason"]] = reasons.get(reject["reason"], 0) + 1
@@ -510,7 +558,7 @@ class PartWriter:
         os.fsync(self._file.fileno())
         self._file.close()
         os.replace(self._path, self._draft.part_path(digest))
-        sync_folder(self._path.parent)
+        sync(self._path.parent)
         for row in self._rows:
             row["part"] = digest
         return {"digest": digest, "bytes": self._tar.size, "rows": self._rows}
@@ -526,12 +574,13 @@ class Store:
 
     def __init__(self, root: Path | str):
         self.root = Path(root).absolute()
+        self._nodes: dict[Path, tuple[Any, _Node]] = {}  # artifacts as gc saw them last
 
     # -- finding
 
     def folder(self, stage: str, key: str) -> Path | None:
         """The folder of the committed artifact, sound or damaged."""
-        return next(iter((self.root / stage).glob(f"*-{key[:12]}")), None)
+        return next(iter((self.root / stage).glob(f"[!.]*-{key[:12]}")), None)
 
     def find(self, stage: str, key: str) -> Artifact | None:
         """The committed artifact; an error where its manifest is damaged."""
@@ -553,7 +602,7 @@ class Store:
         return sorted(path for path in found if (path / "manifest.json").exists() or (path / DRAFT).exists())
 
     def drafts(self) -> list[Path]:
-        return sorted(self.root.glob("[!.]*/*.partial"))
+        return sorted(self.root.glob("[!.]*/[!.]*.partial"))
 
     def resolve(self, reference: str) -> Artifact:
         """The artifact that a person means: a key or its beginning, ``stage/folder``, a folder, or a stage's newest."""
@@ -565,23 +614,55 @@ class Store:
         if not stage and (newest := self.artifacts(reference) if reference.isidentifier() else []):
             return newest[-1]
         token = rest.rpartition("-")[2]
-        found = [a for a in self.artifacts(stage or None) if len(token) >= 4 and a.key.startswith(token)]
+        found = [Artifact(path) for path in self.folders(stage or None) if len(token) >= 4 and self._is_key(token, path)]
         if len(found) == 1:
             return found[0]
         if found:
             raise UserError(f"{reference!r} is the beginning of {len(found)} keys: give more letters")
         raise UserError(f"no artifact {reference!r} in {self.root}: `lightmill ls` lists what is there")
 
+    @staticmethod
+    def _is_key(token: str, folder: Path) -> bool:
+        """Whether the artifact's key begins so. Its folder has twelve letters of it, which is all there is if it is damaged."""
+        if not folder.name[-12:].startswith(token[:12]):
+            return False
+        with contextlib.suppress(Damaged):
+            return Artifact(folder).key.startswith(token)
+        return True
+
     # -- making
 
     def draft(
-        self, stage: str, key: str, preimage: Mapping[str, Any], out: Any = print, origin: Mapping[str, Any] | None = None
+        self,
+        stage: str,
+        key: str,
+        preimage: Mapping[str, Any],
+        out: Any = print,
+        origin: Mapping[str, Any] | None = None,
+        purpose: str = "make",
+        code: str = UNKNOWN,
     ) -> Draft:
-        """A new draft, or the one that an interrupted run left. ``origin``: what it takes to make it anew (system, config)."""
+        """A new draft, or the one that an interrupted run left.
+
+        ``origin``: what it takes to make it anew (system, config). ``purpose``: make, force or repair; what force did not begin
+        itself it sets aside. ``code``: the digest of the code at work.
+        """
         path = self.draft_path(stage, key)
+        before = read_draft(path)
+        begun = any(any((path / folder).glob("[!.]*")) for folder in ("markers", "state"))
+        if begun and purpose == "force" and (before or {}).get("purpose") != "force":
+            aside = self.trash(path)
+            out(f"   note: force takes nothing of what an earlier run had finished; that is in {aside} until gc deletes it")
+            before, begun = None, False
         draft = Draft(path, stage, key, preimage, out)
-        if read_draft(path) is None:
-            write_sealed(path / DRAFT, {"key": key, "preimage": draft.preimage, "started": time.time(), **(origin or {})})
+        about = {"key": key, "preimage": draft.preimage, "started": time.time(), **(origin or {})} if before is None else before
+        others = [other for other in about.get("codes", [UNKNOWN]) if other != code] if begun else []
+        if others and code != UNKNOWN:
+            whose = "code that nobody noted" if others == [UNKNOWN] else "other code of the same version"
+            out(f"   note: what is finished of {stage} was made by {whose}; it is kept (to begin anew, delete {path})")
+        facts = {"purpose": purpose, "codes": [*others, code]}
+        if before is None or not facts.items() <= before.items():
+            write_sealed(path / DRAFT, {**about, **facts})
         return draft
 
     def draft_path(self, stage: str, key: str) -> Path:
@@ -601,7 +682,7 @@ class Store:
                 path.unlink()  # orphans: temporaries of killed workers, parts of another plan
         write_sealed(draft.path / "manifest.json", manifest)
         for folder in ("parts", "files", "."):
-            sync_folder(draft.path / folder)
+            sync(draft.path / folder)
         problems = Artifact(draft.path).verify()
         if problems:  # somebody else is at work in the same draft after all
             raise MachineError(f"{draft.path} changed while it was being committed ({problems[0]}): run the same command again")
@@ -612,11 +693,9 @@ class Store:
         else:
             target = self.root / draft.stage / f"{slug}-{draft.key[:12]}"
             if old is not None:
-                trash = self.root / ".trash"
-                trash.mkdir(exist_ok=True)
-                os.replace(old, trash / f"{draft.stage}-{old.name}-{uuid.uuid4().hex[:8]}")
+                self.trash(old)
             os.replace(draft.path, target)
-            sync_folder(target.parent)
+            sync(target.parent)
             for folder in WORKING:  # only now: until the rename they are what a resume needs
                 shutil.rmtree(target / folder, ignore_errors=True)
         self.touch(draft.key)
@@ -634,8 +713,11 @@ class Store:
             pass  # a read-only store can still be read
 
     def last_used(self, artifact: Artifact) -> float:
-        path = self.root / ".used" / artifact.key
-        return path.stat().st_mtime if path.exists() else artifact.manifest["finished"]
+        return self._used(artifact.key, artifact.manifest["finished"])
+
+    def _used(self, key: str, made: float) -> float:
+        path = self.root / ".used" / key
+        return path.stat().st_mtime if path.exists() else made
 
     def pinned(self, key: str) -> bool:
         return (self.root / ".pins" / key).exists()
@@ -647,30 +729,119 @@ class Store:
         else:
             path.unlink(missing_ok=True)
 
-    def garbage(self, days: float) -> list[tuple[Path, str]]:
+    def trash(self, path: Path) -> Path:
+        """Take a folder of the store out of sight by one rename; returns where it lies until gc empties the trash."""
+        aside = self.root / ".trash" / f"{'-'.join(path.relative_to(self.root).parts)}-{uuid.uuid4().hex[:8]}"
+        aside.parent.mkdir(exist_ok=True)
+        os.replace(path, aside)
+        return aside
+
+    def garbage(self, days: float, claimed: str | None = None) -> list[tuple[Path, str]]:
         """What can go, with the reason: trash, drafts nobody works on, and artifacts nobody needs.
 
-        An artifact is needed while it is pinned, was used within ``days``, or is an input of one that is needed.
+        An artifact is needed while it is pinned, was used within ``days``, or is an input of an artifact that is needed or of
+        a draft that is kept. ``claimed``: a key whose claim the caller holds itself.
         """
         horizon = time.time() - days * 86400
-        found: list[tuple[Path, str]] = [(path, "replaced by a forced rerun") for path in self.root.glob(".trash/*")]
+        found: list[tuple[Path, str]] = []
+        for pattern in TRASH:
+            found += [(path, "trash: replaced or set aside, or left by an interrupted gc") for path in self.root.glob(pattern)]
+        nodes = [node for path in self.folders() if (node := self._node(path)) is not None]
+        todo = [
+            node.key for node in nodes if node.damaged or self.pinned(node.key) or self._used(node.key, node.made) >= horizon
+        ]
         for path in self.drafts():
-            claim = self.claim(path.parent.name, path.name.removesuffix(".partial"))
-            if claim.holder() is None and (path / "markers").exists() and (path / "markers").stat().st_mtime < horizon:
+            key = path.name.removesuffix(".partial")
+            held = key != claimed and self.claim(path.parent.name, key).holder() is not None
+            if not held and not _changed_since(path, horizon):
                 found.append((path, f"unfinished and untouched for {days:g} days"))
-        artifacts = self.artifacts()
-        keep = {a.key for a in artifacts if self.pinned(a.key) or self.last_used(a) >= horizon}
-        for artifact in reversed(artifacts):  # newest first, so that inputs of kept ones are kept in one pass
-            if artifact.key in keep:
-                keep |= set(artifact.manifest["preimage"]["inputs"].values())
-        found += [(a.path, f"not pinned, not used for {days:g} days") for a in artifacts if a.key not in keep]
-        for artifact in artifacts:
-            found += [
-                (artifact.path / name, "left over by a commit that was interrupted")
-                for name in WORKING
-                if artifact.key in keep and (artifact.path / name).exists()
-            ]
+            elif (draft := read_draft(path)) is not None:
+                todo += draft["preimage"]["inputs"].values()
+            else:  # damaged, or not written yet: any artifact may be its input
+                todo += [node.key for node in nodes]
+        inputs = {node.key: node.inputs for node in nodes}
+        needed: set[str] = set()
+        while todo:
+            if (key := todo.pop()) not in needed:
+                needed.add(key)
+                todo += inputs.get(key, ())
+        for node in sorted(nodes, key=lambda node: node.made, reverse=True):
+            if node.key not in needed:
+                found.append((node.path, f"not pinned, not used for {days:g} days"))
+            else:
+                left = [node.path / name for name in WORKING if (node.path / name).exists()]
+                found += [(path, "left over by a commit that was interrupted") for path in left]
         return found
+
+    def remove(self, path: Path, days: float) -> bool:
+        """Delete what ``garbage(days)`` listed, unless somebody works on it or has come to need it since; says whether.
+
+        Out of sight first, so that a kill in the middle leaves no half artifact.
+        """
+        stage, name = path.relative_to(self.root).parts[:2]
+        if stage != ".trash" and not path.name.startswith(".gone-"):
+            node = None if name.endswith(".partial") else self._node(self.root / stage / name)
+            key = node.key if node is not None else name.removesuffix(".partial")
+            claim = self.claim(stage, key)
+            if not claim.take():
+                return False
+            try:
+                if path not in [found for found, _ in self.garbage(days, key)]:
+                    return False
+                path = self.trash(path)
+            finally:
+                claim.release()
+
+        def failed(function: Any, name: str, error: Any) -> None:
+            if not issubclass(error[0], FileNotFoundError):  # another gc is faster
+                raise error[1]
+
+        shutil.rmtree(path, onerror=failed)
+        return True
+
+    def _node(self, folder: Path) -> _Node | None:
+        """What gc must know of an artifact; None where it is gone. Read once: gc looks again before each removal.
+
+        One with a damaged manifest counts as in use: while its inputs are there, it can be repaired.
+        """
+        try:
+            stat = (folder / "manifest.json").stat()
+            stamp = stat.st_ino, stat.st_mtime_ns, stat.st_size
+        except OSError:
+            stamp = None
+        known = self._nodes.get(folder)
+        if known is None or stamp is None or known[0] != stamp:
+            try:
+                about = Artifact(folder).manifest
+            except Damaged:
+                if not folder.exists():
+                    return None
+                about = read_draft(folder) or {"key": folder.name, "preimage": {"inputs": {}}}
+            made, inputs = about.get("finished"), tuple(about["preimage"]["inputs"].values())
+            known = stamp, _Node(folder, about["key"], made or 0.0, inputs, damaged=made is None)
+            self._nodes[folder] = known
+        return known[1]
+
+
+class _Node(NamedTuple):
+    """An artifact as gc sees it."""
+
+    path: Path
+    key: str
+    made: float
+    inputs: tuple[str, ...]  # their keys
+    damaged: bool  # its manifest is
+
+
+def _changed_since(draft: Path, moment: float) -> bool:
+    """Whether anything was written in the draft since then: a part's marker, a log, a checkpoint, a file, the run's state."""
+    for folder in ("running", "state", "markers", "logs", "files"):
+        for where, _, names in os.walk(draft / folder):
+            for name in ("", *names):
+                with contextlib.suppress(FileNotFoundError):
+                    if os.stat(os.path.join(where, name)).st_mtime >= moment:
+                        return True
+    return False
 
 
 class HashCache:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import subprocess
+import sys
 import tarfile
 import time
 from pathlib import Path
@@ -16,6 +19,8 @@ from pipeline.keys import canonical, canonical_json, seed_for
 from pipeline.runner import run_pipeline
 from pipeline.stage import Record
 from pipeline.store import Store
+from pipeline.sweep import plan_of
+from tests.pipeline.toy import Squares
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -203,6 +208,55 @@ def test_verify_deep_finds_planted_corruption(run):
     assert "bytes, not" in artifact.verify()[0]
 
 
+@pytest.fixture
+def synced(monkeypatch):
+    """Inodes in the order in which they were flushed to the disk."""
+    found: list[int] = []
+    fsync = os.fsync
+
+    def noting(handle):
+        found.append(os.fstat(handle).st_ino)
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", noting)
+    return found
+
+
+def test_files_are_on_the_disk_before_the_manifest_vouches_for_them(run, synced, monkeypatch):
+    def finish(self, config, inputs, draft):
+        (draft.files / "checkpoint" / "deep").mkdir(parents=True)
+        for name in ("card.txt", "checkpoint/model", "checkpoint/deep/model"):
+            (draft.files / name).write_text("what a power cut would have lost")
+
+    monkeypatch.setattr(Squares, "finish", finish)
+    artifacts, _ = run()
+    for artifact in artifacts.values():
+        manifest = synced.index((artifact.path / "manifest.json").stat().st_ino)
+        for path in [*artifact.path.glob("files/**/*"), *artifact.path.glob("parts/*.tar")]:
+            assert path.stat().st_ino in synced[:manifest], path
+        for path in (artifact.path / "files", artifact.path / "parts", artifact.path.parent):
+            assert path.stat().st_ino in synced[manifest:], path
+    assert len(list(artifacts["squares"].path.glob("files/**/*"))) == 5
+
+
+def test_a_part_that_had_to_be_copied_is_flushed_too(run, synced, monkeypatch):
+    """Where hard links are not possible; a link needs no flush, its bytes are on the disk."""
+    old, _ = run(stage="numbers")
+
+    def link(source, target):
+        raise OSError("no links here")
+
+    monkeypatch.setattr(os, "link", link)
+    grown, _ = run(stage="numbers", numbers={"n": 20})
+    shared = {p.name for p in (old["numbers"].path / "parts").iterdir()} & {
+        p.name for p in grown["numbers"].path.glob("parts/*")
+    }
+    assert shared
+    for name in shared:
+        inodes = [(artifact["numbers"].path / "parts" / name).stat().st_ino for artifact in (old, grown)]
+        assert inodes[0] != inodes[1] and inodes[1] in synced
+
+
 def test_gc_keeps_pinned_recent_and_their_inputs(run, tmp_path):
     old, _ = run()
     new, _ = run(squares={"offset": 1})
@@ -213,6 +267,154 @@ def test_gc_keeps_pinned_recent_and_their_inputs(run, tmp_path):
     store.pin(new["squares"].key)
     gone = {path for path, _ in store.garbage(days=14)}
     assert gone == {old["squares"].path, old["total"].path, new["total"].path}
+
+
+PAST = time.time() - 30 * 86400
+
+
+def unused(store: Store) -> None:
+    """As if nobody had used the artifacts for a month."""
+    for artifact in store.artifacts():
+        os.utime(store.root / ".used" / artifact.key, (PAST, PAST))
+
+
+def untouched(draft: Path) -> None:
+    for path in sorted(draft.rglob("*"), reverse=True):
+        os.utime(path, (PAST, PAST))
+
+
+def interrupted(run, store: Store) -> tuple[dict, Path]:
+    """Artifacts of numbers and squares, and the draft of a total that a run left."""
+    artifacts, _ = run(stage="squares")
+    planned = plan_of({"system": "tests.pipeline.toy", "stage": "total", "numbers": {}, "squares": {}, "total": {}})["total"]
+    return artifacts, store.draft("total", planned.key, planned.preimage).path
+
+
+@pytest.mark.parametrize("folder", ["state", "logs", "files/validation", "running", "markers"])
+def test_gc_keeps_a_draft_as_long_as_anything_in_it_is_new(run, tmp_path, folder):
+    """A training run that stopped a minute ago, after weeks, and all that it reads."""
+    store = Store(tmp_path / "store")
+    artifacts, draft = interrupted(run, store)
+    unused(store)
+    (draft / folder).mkdir(exist_ok=True)
+    (draft / folder / "training.pt").write_bytes(b"saved a minute ago")
+    untouched(draft)
+    os.utime(draft / folder / "training.pt")
+    assert store.garbage(days=14) == []
+    untouched(draft)
+    assert {path for path, _ in store.garbage(days=14)} == {draft, *(artifact.path for artifact in artifacts.values())}
+
+
+def test_gc_keeps_what_a_run_at_work_reads_however_old(run, tmp_path):
+    store = Store(tmp_path / "store")
+    artifacts, draft = interrupted(run, store)
+    unused(store)
+    untouched(draft)
+    claim = store.claim("total", draft.name.removesuffix(".partial"))
+    with held_elsewhere(claim):
+        assert store.garbage(days=14) == []
+        (draft / "draft.json").write_bytes(b"damaged: it cannot say what it reads")
+        assert store.garbage(days=14) == []
+    assert len(store.garbage(days=14)) == 3
+
+
+def test_what_a_run_found_made_is_in_use_from_its_start_on(run, tmp_path):
+    """Not from when its turn comes, which may be weeks later."""
+    artifacts, _ = run()
+    store = Store(tmp_path / "store")
+    unused(store)
+    with pytest.raises(UserError, match="a bug"):
+        run(force="numbers", numbers={"fail": ["n003"]})
+    assert store.garbage(days=14) == []
+
+
+@contextlib.contextmanager
+def held_elsewhere(claim):
+    """Another process has the claim."""
+    code = f"from pipeline.store import *; print(Claim(Path({str(claim.path)!r})).take(), flush=True); time.sleep(600)"
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout.readline() == "True\n"
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_gc_keeps_all_that_lies_upstream_whatever_was_made_first(run, tmp_path):
+    """Squares were forced after the total was made: they are newer than what needs them, and numbers are needed by them."""
+    run()
+    run(stage="squares", force="squares")
+    store = Store(tmp_path / "store")
+    unused(store)
+    store.pin(store.resolve("total").key)
+    assert {path.parent.name for path, _ in store.garbage(days=14)} == {".trash"}
+
+
+def test_gc_keeps_the_inputs_of_what_can_be_repaired(run, tmp_path):
+    artifacts, _ = run()
+    store = Store(tmp_path / "store")
+    unused(store)
+    (artifacts["squares"].path / "manifest.json").unlink()
+    assert {path for path, _ in store.garbage(days=14)} == {artifacts["total"].path}
+
+
+def test_gc_looks_again_before_each_removal(run, tmp_path):
+    """What came into use after the list was made stays."""
+    store = Store(tmp_path / "store")
+    artifacts, draft = interrupted(run, store)
+    unused(store)
+    untouched(draft)
+    found = [path for path, _ in store.garbage(days=14)]
+    assert found[0] == draft and len(found) == 3
+    with held_elsewhere(store.claim("total", draft.name.removesuffix(".partial"))):
+        assert not any(store.remove(path, days=14) for path in found)
+    run(stage="squares")
+    assert store.remove(draft, days=14)
+    assert not any(store.remove(path, days=14) for path in found[1:])
+    assert set(store.folders()) == {artifact.path for artifact in artifacts.values()}
+    unused(store)
+    assert all(store.remove(path, days=14) for path in found[1:])
+    assert store.folders() == store.drafts() == store.garbage(days=14) == []
+
+
+@pytest.mark.parametrize("struck", ["rename", "delete"])
+def test_a_gc_that_is_interrupted_leaves_only_trash(run, tmp_path, monkeypatch, struck):
+    """Killed after its rename or in the middle of deleting: that is no artifact any more, and the next gc ends it."""
+    artifacts, _ = run()
+    store = Store(tmp_path / "store")
+
+    def die(path, **_):
+        if struck == "delete":
+            (path / "manifest.json").unlink()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("shutil.rmtree", die)
+        with pytest.raises(KeyboardInterrupt):
+            store.remove(artifacts["numbers"].path, days=0)
+    assert store.find("numbers", artifacts["numbers"].key) is None
+    assert len(store.folders()) == 2 and not store.drafts()
+    assert [path.parent.name for path, _ in store.garbage(days=14)] == [".trash"]
+    assert run(squares={"offset": 1})[0]["numbers"].digest == artifacts["numbers"].digest
+    for path, _ in store.garbage(days=14):
+        assert store.remove(path, days=14)
+    assert store.garbage(days=14) == []
+
+
+def test_what_an_earlier_gc_left_half_deleted_is_no_artifact(run, tmp_path):
+    """Before there was the trash, gc renamed an artifact to .gone-<its name> beside the others."""
+    artifacts, _ = run()
+    store, numbers = Store(tmp_path / "store"), artifacts["numbers"]
+    aside = numbers.path.with_name(f".gone-{numbers.path.name}")
+    numbers.path.rename(aside)
+    (artifacts["squares"].path / ".gone-markers").mkdir()
+    aside.with_name(f".gone-{numbers.key}.partial").mkdir()
+    assert store.find("numbers", numbers.key) is None and store.drafts() == []
+    assert {path.name for path, _ in store.garbage(days=14)} == {
+        aside.name, ".gone-markers", f".gone-{numbers.key}.partial",
+    }  # fmt: skip
+    assert run(squares={"offset": 1})[0]["numbers"].digest == numbers.digest
 
 
 def test_resolve_takes_keys_names_and_stages(run, tmp_path):

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import builtins
+import errno
+import io
 import json
+import os
 import random
 from pathlib import Path
 
@@ -10,7 +14,8 @@ import pytest
 
 from pipeline import commands
 from pipeline.errors import Damaged, UserError
-from pipeline.repair import repair
+from pipeline.listing import Row
+from pipeline.repair import repair, sound_parts
 from pipeline.runner import run_pipeline
 from pipeline.store import Artifact, Store
 
@@ -135,6 +140,148 @@ def test_repair_says_so_where_the_result_is_another(run, tmp_path):
     flip(artifacts["squares"].part_of("n004")[0])
     lines = mend(tmp_path, artifacts["squares"])
     assert any("DIFFERENT from before" in line and "later stages still hold" in line for line in lines)
+
+
+@pytest.mark.parametrize("copies", ["manifest.json", "manifest.json draft.json"])
+def test_an_artifact_with_a_damaged_manifest_is_found_by_its_key_and_its_name(run, tmp_path, copies):
+    artifacts, _ = run()
+    store, numbers = Store(tmp_path / "store"), artifacts["numbers"]
+    key, name = numbers.key, numbers.path.name
+    for copy in copies.split():
+        flip(numbers.path / copy)
+    for reference in (
+        key,
+        key[:12],
+        key[:6],
+        name,
+        f"numbers/{name}",
+        f"numbers/{key[:12]}",
+        f"numbers/{key}",
+        str(numbers.path),
+    ):
+        assert store.resolve(reference).path == numbers.path, reference
+    assert repr(store.resolve(key)) == f"Artifact(numbers/{name})"
+    for reference in (key[:4] + "zzzz", f"squares/{key}", key[1:13]):
+        with pytest.raises(UserError, match="no artifact"):
+            store.resolve(reference)
+    other = artifacts["squares"].key  # of a readable one all letters count
+    with pytest.raises(UserError, match="no artifact"):
+        store.resolve(other[:20] + "zz")
+    parsed = parser().parse_args(["repair", key, "--workers", "0", "--store", str(store.root)])
+    if copies == "manifest.json":
+        assert parsed.function(parsed) == 0
+        assert store.resolve("numbers").digest == numbers.digest
+    else:
+        with pytest.raises(Damaged, match="delete the folder"):
+            parsed.function(parsed)
+
+
+def test_repair_reads_the_listing_part_by_part(run, tmp_path, monkeypatch):
+    """There may be millions of rows: no more than a part's are held, wherever the listing has its damage."""
+    artifacts, _ = run(numbers={"n": 40})
+    artifact = artifacts["squares"]
+    computed(tmp_path)
+    path = artifact.path / "items.jsonl"
+    lines = path.read_text().splitlines()
+    for number in (4, len(lines) - 1):
+        lines[number] = "?"
+    path.write_text("\n".join(lines) + "\n")
+    parsed: list[Row] = []
+    monkeypatch.setattr(Row, "from_json", lambda line, parse=Row.from_json: parsed.append(parse(line)) or parsed[-1])
+    assert len(next(sound_parts(Artifact(artifact.path)))["rows"]) == 3 and len(parsed) == 4
+    mend(tmp_path, artifact)
+    parts = [part["items"] for part in artifact.manifest["outputs"]["parts"]]
+    assert computed(tmp_path) == sorted([*parts[1], *parts[-1]])
+    assert Store(tmp_path / "store").resolve("squares").verify(deep=True) == []
+
+
+@pytest.fixture
+def unreadable(monkeypatch):
+    """unreadable(path, ...): from here on the disk cannot read these files, as long as they are not made anew."""
+    real = builtins.open
+    bad = {}  # by inode; held open, so that no new file gets its number
+
+    def spoilt(path, mode="r", *arguments, **more):
+        if not isinstance(path, int) and set(mode) <= set("rbt") and Path(path).exists() and os.stat(path).st_ino in bad:
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return real(path, mode, *arguments, **more)
+
+    def spoil(*paths: Path) -> None:
+        bad.update({path.stat().st_ino: real(path, "rb") for path in paths})
+        monkeypatch.setattr(builtins, "open", spoilt)
+        monkeypatch.setattr(io, "open", spoilt)
+
+    yield spoil
+    for file in bad.values():
+        file.close()
+
+
+def test_verify_and_repair_go_on_after_a_file_that_cannot_be_read(run, tmp_path, unreadable, capsys):
+    artifacts, _ = run()
+    artifact = artifacts["squares"]
+    computed(tmp_path)
+    lost, flipped = (artifact.part_of(name)[0] for name in ("n004", "n005"))
+    assert lost != flipped
+    flip(flipped)
+    cut(artifacts["total"].file("total.txt"))
+    unreadable(lost, artifact.path / "files" / "card.txt")
+    parsed = parser().parse_args(["verify", "--deep", "--store", str(tmp_path / "store")])
+    assert parsed.function(parsed) == Damaged.status
+    told = capsys.readouterr().out
+    for problem in (
+        f"{lost.name} cannot be read (Input/output error)",
+        "card.txt cannot be read",
+        f"{flipped.name} does not hash",
+    ):
+        assert problem in told
+    assert "1 of 3 artifacts sound" in told
+    lines = mend(tmp_path, artifact)
+    assert computed(tmp_path) == sorted(row.item for row in artifact.rows() if row.part in (lost.stem, flipped.stem))
+    assert any("equal to before" in line for line in lines)
+    assert Store(tmp_path / "store").resolve("squares").verify(deep=True) == []
+
+
+@pytest.mark.parametrize("name", ["items.jsonl", "rejects.jsonl", "manifest.json"])
+def test_a_listing_or_manifest_that_cannot_be_read_is_damage(run, tmp_path, unreadable, name):
+    artifacts, _ = run()
+    numbers = artifacts["numbers"]
+    unreadable(numbers.path / name)
+    (problem,) = Artifact(numbers.path).verify(deep=True)
+    assert name in problem and "Input/output error" in problem
+    with pytest.raises(Damaged, match="lightmill repair"):
+        run(squares={"offset": 1}) if name != "rejects.jsonl" else Artifact(numbers.path).rejects()
+    mend(tmp_path, numbers)
+    mended = Store(tmp_path / "store").resolve("numbers")
+    assert mended.digest == numbers.digest and mended.verify(deep=True) == []
+
+
+def test_a_reader_meets_an_unreadable_part_as_damage(run, unreadable):
+    artifacts, _ = run(stage="numbers")
+    unreadable(artifacts["numbers"].part_of("n004")[0])
+    with pytest.raises(Damaged, match=r"cannot be read \(Input/output error\); `lightmill repair numbers/"):
+        run()
+
+
+def test_a_resume_makes_a_part_that_cannot_be_read_again(run, tmp_path, unreadable):
+    with pytest.raises(UserError, match="n013"):
+        run(stage="numbers", numbers={"n": 15, "fail": ["n013"]})
+    (draft,) = Store(tmp_path / "store").drafts()
+    unreadable(sorted(draft.glob("parts/*.tar"))[0])
+    artifacts, lines = run(stage="numbers")
+    assert any("1 finished part(s) of the interrupted run are damaged and made again" in line for line in lines)
+    assert artifacts["numbers"].verify(deep=True) == []
+
+
+def test_a_damaged_part_of_a_draft_does_not_pass_for_one_that_is_taken_over(run, tmp_path):
+    """An earlier artifact has the same part, sound: it replaces the damaged one of that name."""
+    run(stage="numbers", numbers={"n": 8})
+    with pytest.raises(UserError, match="n013"):
+        run(stage="numbers", numbers={"n": 15, "fail": ["n013"]})
+    (draft,) = Store(tmp_path / "store").drafts()
+    for path in draft.glob("parts/*.tar"):
+        flip(path)
+    artifacts, _ = run(stage="numbers")
+    assert artifacts["numbers"].verify(deep=True) == []
 
 
 def test_a_run_stage_is_repaired_as_a_whole(run, tmp_path):
