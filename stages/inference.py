@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import UserError
-from stages.predict import predict_frames, single_lights
+from stages.predict import light_passes, predict_frames
 
 if TYPE_CHECKING:
     from stages.records import SceneRecord
@@ -142,9 +142,10 @@ class Renderer:
     def _frames(
         self, scene: SceneRecord, views: Sequence[int], size: tuple[int, int], composite_lights: bool
     ) -> Iterator[np.ndarray]:
-        passes = single_lights(scene) if composite_lights else [scene]
-        for layers in zip(*(predict_frames(self.model, lit, views, size, self.device) for lit in passes), strict=True):
-            frame = np.sum(layers, axis=0)
+        passes = list(light_passes(scene)) if composite_lights else [(scene, 1.0)]
+        predicted = [predict_frames(self.model, lit, views, size, self.device) for lit, _ in passes]
+        for layers in zip(*predicted, strict=True):
+            frame = sum(np.float32(share) * layer for layer, (_, share) in zip(layers, passes, strict=True))
             if not np.isfinite(frame).all():
                 raise UserError(f"{self.folder} predicts NaN or infinity for {scene.id}: its training has diverged")
             yield frame

@@ -39,8 +39,7 @@ def beyond_limits(
 ) -> list[str]:
     """A sentence for each limit of the training data that the scene, seen by ``views`` at (height, width) pixels, is beyond.
 
-    ``composite_lights``: it is rendered light by light, so that their number is no limit and each is to be as bright as
-    a single light of training.
+    ``composite_lights``: it is rendered light by light, so that their number is no limit.
     """
     return [
         *_size(scene, resolution, trained_with),
@@ -48,6 +47,18 @@ def beyond_limits(
         *_cameras(scene, list(views)),
         *_materials(scene),
     ]
+
+
+def _areas(triangles: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1) / 2
+
+
+def light_radiance(scene: SceneRecord) -> np.ndarray:
+    """(L,) radiance of each light, the mean over its area and the colour channels."""
+    emits = scene.light_index >= 0
+    areas, light = _areas(scene.triangles[emits].astype(np.float64)), scene.light_index[emits]
+    power = np.bincount(light, areas * scene.emission[emits].mean(axis=1, dtype=np.float64), minlength=scene.n_lights)
+    return power / np.maximum(np.bincount(light, areas, minlength=scene.n_lights), 1e-12)
 
 
 def _outside(values: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -92,15 +103,10 @@ def _lights(scene: SceneRecord, one_by_one: bool) -> Iterator[str]:
         return
     emission, light = scene.emission[emits].astype(np.float64), scene.light_index[emits]
     triangles = scene.triangles[emits].astype(np.float64)
-    areas = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1) / 2
+    areas = _areas(triangles)
     area = np.bincount(light, areas, minlength=count)
-    power = np.bincount(light, areas * emission.mean(axis=1), minlength=count)
-    radiance = power / np.maximum(area, 1e-12)
-    low, high = law.radiance
-    if one_by_one:  # each pass has one light, which in training has all the radiance
-        yield from _worst(radiance, low, high, "a light, alone in its pass, of a radiance of", digits=0)
-    else:
-        yield from _worst(np.array([radiance.sum()]), low, high, "lights of a total radiance of", digits=0)
+    low, high = law.radiance  # also of a light alone in its pass, which is made as bright as all together
+    yield from _worst(np.array([light_radiance(scene).sum()]), low, high, "lights of a total radiance of", digits=0)
     small = 0.0022 * law.scale[0] ** 2  # of the light triangle, before it is scaled
     yield from _worst(area, small / 2, 2 * 0.0022 * law.scale[1] ** 2, "a light of area", digits=4)
     centres = np.stack([np.bincount(light, areas * triangles.mean(axis=1)[:, i], minlength=count) for i in range(3)], axis=1)

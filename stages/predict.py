@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stages.limits import light_radiance
+
 if TYPE_CHECKING:
     from model.renderformer import RenderFormer
     from stages.records import SceneRecord
@@ -60,3 +62,16 @@ def single_lights(scene: SceneRecord) -> Iterator[SceneRecord]:
             name: np.where(off[:, None], np.float32(0), getattr(scene, name)) for name in ("diffuse", "specular", "emission")
         }
         yield replace(scene, **dark)
+
+
+def light_passes(scene: SceneRecord) -> Iterator[tuple[SceneRecord, float]]:
+    """For each light the scene under it alone, made as bright as all lights together, and its share of that.
+
+    The image is the sum over passes of share times prediction. Without the exposure, which light transport takes back exactly,
+    each pass of many would be darker than anything that a network was trained with (docs/probes.md, probe=lights).
+    """
+    radiance = light_radiance(scene)
+    shares = radiance / radiance.sum()
+    for alone, share in zip(single_lights(scene), shares, strict=True):
+        if share > 0:
+            yield replace(alone, emission=(alone.emission / share).astype(np.float32)), float(share)

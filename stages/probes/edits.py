@@ -129,11 +129,6 @@ def light_triangle(light: Light) -> np.ndarray:
     return meshes.LIGHT_TRIANGLE @ rotation_matrix(light.rotation_deg).T * light.scale + light.position
 
 
-def exposed(scene: SceneRecord, factor: float) -> SceneRecord:
-    """Every light ``factor`` times as bright."""
-    return replace(scene, emission=scene.emission * np.float32(factor))
-
-
 def tinted(scene: SceneRecord, colours: np.ndarray) -> SceneRecord:
     """Each light's radiance times its (L, 3) colour."""
     lit = scene.light_index >= 0

@@ -55,16 +55,13 @@ class Lights(Sweep):
         return edits.draw_nested_lights(scene, int(value), worker.rng("lights", scene.id))
 
     def methods(self, worker: Worker, predict: Predict, scene: SceneRecord) -> Methods:
-        from stages.predict import single_lights
-
-        def composited(exposure: float) -> np.ndarray:
-            return sum(predict(edits.exposed(alone, exposure)) for alone in single_lights(scene)) / exposure
+        from stages.predict import light_passes, single_lights
 
         return {
             "all at once": lambda: predict(scene),
-            "sum of single lights": lambda: composited(1.0),
+            "sum of single lights": lambda: sum(predict(alone) for alone in single_lights(scene)),
             # a light of N emits 1/N of what a single one does in training: expose it like that, and take it back
-            "sum, each exposed as in training": lambda: composited(float(scene.n_lights)),
+            "sum, each exposed as in training": lambda: sum(share * predict(alone) for alone, share in light_passes(scene)),
         }
 
     def trained(self, trained_with: Mapping[str, str]) -> tuple[float, float]:
