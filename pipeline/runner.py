@@ -450,7 +450,7 @@ def _run_map(
         state.add_rejects(result.rejects)
         state.update(now=bool(result.failed), done=progress.done)
 
-    limits = parse(Limits, {**stage.limits, **config.limits}, f"{planned.name}.limits")
+    limits = Limits(**{**stage.limits, **config.limits.model_dump(exclude_none=True)})
     workers = config.workers if config.workers is not None else run.workers
     cores = os.cpu_count() or 1
     workers = cores if workers == "auto" else workers
