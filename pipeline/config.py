@@ -7,6 +7,7 @@ right one; ``runtime`` fields (workers, devices, logging) stay out of keys.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,10 @@ class Limits(Section):
     cpu_s: float = 600.0  # CPU seconds
     wall_s: float = 1800.0  # seconds on the clock, for what hangs without computing
     memory_gb: float = 8.0  # resident memory of the worker
+
+    def exceed(self, reject: Mapping[str, Any]) -> bool:
+        """Whether one of these is higher than the limit that the rejected item ran into, if it did."""
+        return any(getattr(self, name) > limit for name, limit in reject.get("limit", {}).items())
 
 
 class StageLimits(Section):

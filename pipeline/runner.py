@@ -411,34 +411,40 @@ def _run_map(
         part_key = digest_of({"group": group, "items": part_item_keys})
         parts[part_key] = group, tuple(items[index] for index in indices), part_item_keys
     markers, damaged = draft.sound_markers({key: [item.id for item in part_items] for key, (_, part_items, _) in parts.items()})
+    limits = Limits(**{**stage.limits, **config.limits.model_dump(exclude_none=True)})
     tasks: list[PartTask] = []
-    total, reused = len(items), 0
+    fresh: dict[str, int] = {}  # part key -> items to compute
+    total, again = len(items), 0
     for part_key, (group, part_items, part_item_keys) in parts.items():
         marker = markers[part_key]
-        if marker is not None:
-            reused += len(part_items)
+        allowed = {reject["item"] for reject in marker["rejects"] if limits.exceed(reject)} if marker is not None else set()
+        if marker is not None and not allowed:
             state.add_rejects(Counter(reject["reason"] for reject in marker["rejects"]))
             continue
+        again += len(allowed)
+        wanted = zip(part_items, part_item_keys, strict=True)
         reuse = {
-            item.id: donors[item_key] for item, item_key in zip(part_items, part_item_keys, strict=True) if item_key in donors
+            item.id: donors[item_key] for item, item_key in wanted if item_key in donors and (not allowed or item.id in allowed)
         }
-        reused += len(reuse)
+        fresh[part_key] = len(allowed or part_items) - len(reuse)
         tasks.append(
             PartTask(
                 run.system, planned.name, planned.key, config, inputs, environment, draft.path,
-                part_key, group, part_items, part_item_keys, reuse,
+                part_key, group, part_items, part_item_keys, reuse, limits=limits,
             )
         )  # fmt: skip
+    reused = total - sum(fresh.values())
     if not forced:
         sources: dict[Path, _Source] = {}
         tasks = [task for task in tasks if not _link_whole(task, sources, draft)]
     label = _label(system, planned.name)
+    if again:
+        out(f"{label} {again} item(s) that lower limits rejected before are tried again")
     if damaged:
         out(f"{label} {damaged} finished part(s) of the interrupted run are damaged and made again")
     out(f"{label} running    {total} items" + (f", {reused} of them already there" if reused else ""))
     progress = Progress(f"{label}", total, reused)
     failed: list[tuple[str, str, Path]] = []
-    fresh = {task.part_key: len(task.items) - len(task.reuse) for task in tasks}
     state.update(now=True, parts=len(parts), total=total, reused=reused, done=reused)
 
     def on_result(result: PartResult) -> None:
@@ -450,7 +456,6 @@ def _run_map(
         state.add_rejects(result.rejects)
         state.update(now=bool(result.failed), done=progress.done)
 
-    limits = Limits(**{**stage.limits, **config.limits.model_dump(exclude_none=True)})
     workers = config.workers if config.workers is not None else run.workers
     cores = os.cpu_count() or 1
     workers = cores if workers == "auto" else workers
