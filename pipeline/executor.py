@@ -38,6 +38,7 @@ from pipeline.worker import (
     write_log,
 )
 
+REASONS = ("crash", "time", "memory")  # of rejects that are the machine's doing
 POLL_S = 0.25
 MAX_POOLS = 8  # that break as a whole
 MAX_UNEXPLAINED = 4  # deaths of a part's worker beyond what its items can explain

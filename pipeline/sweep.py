@@ -180,14 +180,16 @@ def live_with_the_sweep() -> None:
 def _complete(job: Job) -> bool:
     run = split_config(job.root)[0]
     store = Store(run.store)
-    return not run.force and all(store.find(name, job.plan[name].key) is not None for name in run.stage)
+    return not run.force and not run.retry and all(store.find(name, job.plan[name].key) is not None for name in run.stage)
 
 
 def _make_shared(job: Job, shared: Mapping[str, str], command: Sequence[str], out: Callable[[str], None]) -> None:
     """What all jobs read, once and with all workers, instead of by one job for which the others wait."""
     run = split_config(job.root)[0]
-    forced = [name for name in run.force if name in shared]
-    if forced:
-        raise UserError(f"force={','.join(forced)}: all jobs of the sweep share it; force it by itself, then run the sweep")
+    for setting, names in (("force", run.force), ("retry", run.retry)):
+        if ours := [name for name in names if name in shared]:
+            raise UserError(
+                f"{setting}={','.join(ours)}: all jobs of the sweep share it; do that by itself, then run the sweep"
+            )
     read = {parent for name in shared for parent in job.plan[name].stage.reads(job.plan[name].config)}
-    run_pipeline({**job.root, "stage": [name for name in shared if name not in read], "force": []}, command, out)
+    run_pipeline({**job.root, "stage": [name for name in shared if name not in read], "force": [], "retry": []}, command, out)

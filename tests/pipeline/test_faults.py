@@ -151,6 +151,32 @@ def test_a_raised_limit_tries_again_what_the_lower_one_rejected_and_nothing_else
     assert [(reject["item"], reject["reason"]) for reject in artifact.rejects()] == [("n005", "crash")]
 
 
+def test_what_the_machine_rejected_is_told_and_can_be_tried_again(tmp_path, undisturbed):
+    """In a committed artifact: the rest of it is taken over, whole parts by hard link."""
+    log = tmp_path / "computed"
+
+    def run(*retry: str, **numbers) -> tuple[int, str, list[str]]:
+        log.write_text("")
+        words = command(tmp_path, "numbers", retry=retry, numbers={"n": 12, "log_to": str(log), **numbers})
+        status, output = finish(start(words))
+        return status, output, sorted(log.read_text().split())
+
+    assert run(crash=["n002"], sleep=["n003"], limits={"wall_s": 0.5})[0] == 0
+    inodes = {path.stat().st_ino for path in tmp_path.glob("numbers/*/parts/*.tar")}
+    status, output, computed = run()
+    assert (status, computed) == (0, [])
+    assert "up to date" in output and "note: the machine rejected 2 of its items (1 crash, 1 time)" in output
+    assert " retry=numbers, numbers.limits.wall_s=N allows more than 0.5" in output
+    status, output, computed = run("numbers", sleep=["n003"], limits={"wall_s": 0.5})  # n002 goes well now
+    assert (status, set(computed)) == (0, {"n002", "n003"}) and "DIFFERENT from before" in output
+    assert len(inodes & {path.stat().st_ino for path in tmp_path.glob("numbers/v1-*/parts/*.tar")}) == 2  # of four
+    status, output, computed = run("numbers")
+    assert (status, computed) == (0, ["n003"])
+    assert digests(tmp_path)["numbers"] == undisturbed(12)["numbers"]
+    status, output, computed = run("numbers")
+    assert (status, computed) == (0, []) and "up to date" in output and "note" not in output
+
+
 def test_a_kill_between_the_tries_under_two_limits_costs_nothing_that_was_finished(tmp_path, undisturbed):
     log = tmp_path / "computed"
     numbers = {"n": 6, "log_to": str(log), "max_reject_share": 0}

@@ -91,7 +91,8 @@ def test_a_job_whose_config_is_not_the_planned_one_stops(tmp_path):
     assert not Store(tmp_path / "store").artifacts()
 
 
-def test_what_all_jobs_share_is_not_forced_by_each_of_them(tmp_path):
-    words = ["stage=remesh", "remesh.resolution=48,49", "collect.per_family=1", "force=collect", "jobs=2", "-m"]
+@pytest.mark.parametrize("setting", ["force", "retry"])
+def test_what_all_jobs_share_is_not_forced_by_each_of_them(tmp_path, setting):
+    words = ["stage=remesh", "remesh.resolution=48,49", "collect.per_family=1", f"{setting}=collect", "jobs=2", "-m"]
     done = run(tmp_path, *words)
-    assert done.returncode == 2 and "force=collect: all jobs of the sweep share it" in done.stderr
+    assert done.returncode == 2 and f"{setting}=collect: all jobs of the sweep share it" in done.stderr
