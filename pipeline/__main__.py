@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import sys
@@ -30,6 +29,7 @@ from pipeline.sweep import (
     is_hydras,
     keys_of,
     live_with_the_sweep,
+    planned_keys,
     run_side_by_side,
 )
 
@@ -117,7 +117,7 @@ def main(words: Sequence[str] | None = None) -> int:
                     failures.extend(report(statuses))
                     return
                 overrides[:] = for_hydra(overrides)
-                os.environ[KEYS_VARIABLE] = json.dumps({job.name: keys_of(job.plan) for job in jobs})
+                os.environ[KEYS_VARIABLE] = planned_keys({job.name: keys_of(job.plan) for job in jobs})
             else:
                 split_config(compose(overrides))  # a bad override gets our message instead of Hydra's
         sys.argv = ["lightmill", *flags[:1], *overrides]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -10,8 +9,22 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.errors import UserError
+from pipeline.hydra_config import compose
 from pipeline.store import Store
-from pipeline.sweep import JOB_VARIABLE, KEYS_VARIABLE, describe, expand, label, shared_stages, sweep_keys
+from pipeline.sweep import (
+    JOB_VARIABLE,
+    KEYS_VARIABLE,
+    check_keys,
+    describe,
+    expand,
+    keys_of,
+    label,
+    plan_of,
+    planned_keys,
+    shared_stages,
+    sweep_keys,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -85,10 +98,29 @@ def test_a_failed_job_leaves_the_others_and_is_taken_up_again(tmp_path, folders)
 
 
 def test_a_job_whose_config_is_not_the_planned_one_stops(tmp_path):
-    keys = json.dumps({f"stage=collect collect.per_family=1 store={tmp_path}/store": {"collect": "0" * 64}})
+    keys = planned_keys({f"stage=collect collect.per_family=1 store={tmp_path}/store": {"collect": "0" * 64}})
     done = run(tmp_path, "stage=collect", "collect.per_family=1", **{KEYS_VARIABLE: keys, JOB_VARIABLE: "1"})
     assert done.returncode == 2 and "changed after the sweep began" in done.stderr
     assert not Store(tmp_path / "store").artifacts()
+
+
+def test_a_sweep_of_thousands_of_jobs_starts_processes_and_knows_all_their_keys(tmp_path, monkeypatch):
+    """All keys go into one variable of the environment, and Linux refuses those of 128 KiB."""
+    jobs = {
+        f"stage=collect collect.per_family={number} store={tmp_path}": {"collect": f"{number:064}"} for number in range(8000)
+    }
+    monkeypatch.setenv(KEYS_VARIABLE, planned_keys(jobs))
+    subprocess.run(["true"], check=True)
+    root = compose(["stage=collect", "collect.per_family=1", f"store={tmp_path}"])
+    for task in list(jobs)[::1000]:
+        with pytest.raises(UserError, match="changed after the sweep began"):
+            check_keys(task, root)
+    check_keys("stage=collect collect.per_family=9000", root)  # no job of the sweep
+    task = list(jobs)[1]
+    monkeypatch.setenv(KEYS_VARIABLE, planned_keys(jobs | {task: keys_of(plan_of(root))}))
+    check_keys(task, root)
+    with pytest.raises(UserError, match="8001 jobs: at most 8000"):
+        planned_keys(jobs | {"more": {}})
 
 
 @pytest.mark.parametrize("setting", ["force", "retry"])
