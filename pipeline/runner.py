@@ -33,6 +33,7 @@ from pipeline.errors import (
     MachineError,
     TooManyRejects,
     UserError,
+    for_people,
     status_of,
 )
 from pipeline.executor import REASONS, run_parts
@@ -366,17 +367,19 @@ def make_artifact(
                 return made
         if isinstance(error, OSError) and (error.errno in STORAGE_ERRORS or str(error.filename).startswith(f"{store.root}/")):
             where = f" ({error.filename})" if error.filename else ""
+            remedy = "make room or mend the disk, and" if error.errno in STORAGE_ERRORS else "--debug says who asked for it;"
             error = MachineError(
-                f"{name}: the store at {store.root} cannot be written: {error.strerror}{where}. Finished parts are kept: make "
-                "room or mend the disk, and run the same command again"
+                f"{name}: the store at {store.root} cannot be read or written: {error.strerror}{where}. Finished parts are "
+                f"kept: {remedy} run the same command again"
             )
+        if isinstance(error, Exception) and not for_people(error):
+            error.add_note(f"in stage {name} ({draft_path})")
         if state is not None:
             with contextlib.suppress(OSError):
                 draft.sweep()  # on a full disk it is room to go on with
             interrupted = isinstance(error, KeyboardInterrupt)
-            state.end(
-                INTERRUPTED if interrupted else status_of(error), "interrupted" if interrupted else str(error) or repr(error)
-            )
+            message = "interrupted" if interrupted else str(error) if for_people(error) else repr(error)
+            state.end(INTERRUPTED if interrupted else status_of(error), message)
         raise error
     finally:
         claim.release()

@@ -183,7 +183,8 @@ def run_side_by_side(
         assert process.stdout is not None
         for line in process.stdout:
             say(line.rstrip("\n"))
-        return process.wait()
+        status = process.wait()
+        return status if status >= 0 else 128 - status  # killed by a signal: the shells' number
 
     pool = ThreadPoolExecutor(at_once)
     try:

@@ -9,11 +9,14 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from model.errors import InputError
+from pipeline.__main__ import main
 from pipeline.config import parse
-from pipeline.errors import UserError
+from pipeline.errors import MachineError, UserError
 from pipeline.hydra_config import CONF, compose
 from pipeline.keys import canonical
 from pipeline.stage import MapStage, load_system
+from stages import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 SYSTEM = load_system("renderformer")
@@ -106,6 +109,28 @@ def test_command_line_accepts_the_sweep_flag_anywhere(tmp_path, flags):
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("06 train") == (2 if flags else 1)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [(UserError("mend it"), 2), (InputError("mend it"), 2), (MachineError("mend it"), 6), (ValueError(), 1)],
+)
+def test_only_errors_for_people_are_one_line(tmp_path, monkeypatch, capsys, error, status):
+    """Those of model/, which does not know the engine, too; any other ValueError is a bug and shows where it is."""
+
+    def fail(*arguments) -> None:
+        raise error
+
+    monkeypatch.setattr("pipeline.__main__.run_pipeline", fail)
+    monkeypatch.setattr(sys, "argv", ["lightmill"])
+    words = ["stage=collect", f"store={tmp_path}", f"hydra.run.dir={tmp_path}/r"]
+    for start in (main, lambda words: cli.main(["run", *words])):
+        if status == 1:
+            with pytest.raises(ValueError):
+                start(words)
+        else:
+            assert start(words) == status
+            assert capsys.readouterr().err.splitlines()[-1] == "error: mend it"
 
 
 def test_error_is_one_line_with_a_status(tmp_path):

@@ -375,4 +375,9 @@ def test_each_kind_of_trouble_has_its_exit_status(tmp_path):
     assert code == ItemsFailed.status and "RuntimeError: a bug" in output
     log = Path(output.partition("Its traceback: ")[2].partition(" (")[0])
     assert "n003: " in log.read_text() and "RuntimeError: a bug" in log.read_text()
+    code, output = status(numbers={"n": 7}, squares={"bug": "value"})  # a ValueError is no user's fault by itself
+    assert code == 1 and "Traceback" in output and "in stage squares" in output
+    code, output = status(numbers={"n": 7}, squares={"bug": "file"})
+    assert code == MachineError.status and "Traceback" not in output
+    assert "cannot be read or written: No such file or directory" in output and "nowhere" in output
     assert status(numbers={"n": 7})[0] == 0

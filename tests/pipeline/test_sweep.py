@@ -22,6 +22,7 @@ from pipeline.sweep import (
     label,
     plan_of,
     planned_keys,
+    run_side_by_side,
     shared_stages,
     sweep_keys,
 )
@@ -121,6 +122,14 @@ def test_a_sweep_of_thousands_of_jobs_starts_processes_and_knows_all_their_keys(
     check_keys(task, root)
     with pytest.raises(UserError, match="8001 jobs: at most 8000"):
         planned_keys(jobs | {"more": {}})
+
+
+def test_a_job_that_a_signal_killed_has_the_status_that_a_shell_gives_it(tmp_path, monkeypatch):
+    killed = [sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"]
+    popen = subprocess.Popen
+    monkeypatch.setattr("pipeline.sweep.subprocess.Popen", lambda words, **options: popen(killed, **options))
+    jobs = expand(["stage=collect", "collect.per_family=1,2", f"store={tmp_path}"])
+    assert run_side_by_side(jobs, 2, [], ["test"], print) == {"1": 137, "2": 137}
 
 
 @pytest.mark.parametrize("setting", ["force", "retry"])
