@@ -4,14 +4,17 @@
 
 store    a million items with empty payloads in 10,000 parts, and a second artifact made from it but for its last 10 parts.
          Time and peak memory of ``ls``, of planning, of resuming the second, of ``verify`` and ``verify --deep``, each in
-         a process of its own. *build* makes the store with the engine's own writers, without waiting for the disk.
+         a process of its own. *build* makes the store with the engine's own writers, without waiting for the disk. Memory:
+         resident, of the process and of the largest worker; *all* is theirs together, with what they share counted once.
 workers  remesh and render on one and on two workers of one thread each, beside one and two copies of a pure CPU loop: a
          machine whose cores share caches, memory or clocks does not double either. Every item is a part of its own here, so
          that no worker runs out of work early and the cost of parts is in it. *Steady* is the work done per second while both
          workers are at work, in units of what the same parts took one worker; *whole* is the stage from its call to its
          artifact: start of processes, imports, opening, finish and all. Bar: steady at least 0.95 of the loop's.
 model    time, storage and cost of 2M scenes x 4 views, from what items took and weighed in the artifacts of ``--store``,
-         or in a sample made for it (the paper's settings at 256 px on made-up objects). What is assumed is an option.
+         or in a sample made for it (experiment=paper_256 on made-up objects). Per item that a stage keeps: the CPU time of
+         all that it tried (but for items that a limit killed: nobody knows theirs) and the bytes of its parts. What is
+         assumed is an option.
 
 Some 20 minutes on two quiet cores.
 """
@@ -20,10 +23,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import os
 import re
-import resource
 import shutil
 import statistics
 import subprocess
@@ -34,6 +37,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
+
+import psutil
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)] * (str(ROOT) not in sys.path)  # for the system below and in workers
@@ -128,26 +133,65 @@ def step(name: str, folder: Path, items: int) -> None:
         assert commands.command_verify(Store(folder), arguments) == 0
     else:
         runner.run_pipeline({**config_of(folder, items), "workers": 2, "plan": name == "plan"}, ["bench"])
-    peak = {who: resource.getrusage(kind).ru_maxrss / 1024 for who, kind in RUSAGE.items()}
-    print(json.dumps({"wall": time.monotonic() - began, "cpu": time.process_time() - before, **peak}))
+    print(json.dumps({"wall": time.monotonic() - began, "cpu": time.process_time() - before}))
 
 
-RUSAGE = {"own": resource.RUSAGE_SELF, "worker": resource.RUSAGE_CHILDREN}
+class Memory(NamedTuple):
+    """Peaks in MB: resident, of a process and of the largest below it; and of all together, shared pages counted once."""
+
+    own: float
+    worker: float
+    all: float
+
+
+def watch_memory(process: subprocess.Popen) -> Memory:
+    """Until the process ends. Not getrusage: what it says of a process begins with the size of the one that started it."""
+    own = worker = together = 0.0
+    root = psutil.Process(process.pid)
+    for tick in itertools.count():
+        with contextlib.suppress(psutil.Error):
+            own = max(own, root.memory_info().rss)
+            family = root.children(recursive=True)
+            for child in family:
+                with contextlib.suppress(psutil.Error):
+                    worker = max(worker, child.memory_info().rss)
+            if tick % SLOW == 0:
+                together = max(together, sum(_shared_fairly(member) for member in (root, *family)))
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(POLL_S)
+            return Memory(own / 2**20, worker / 2**20, together / 2**20)
+    raise AssertionError
+
+
+def _shared_fairly(process: psutil.Process) -> float:
+    """Proportional set size in bytes: a page of many processes counts in each by its share."""
+    try:
+        return process.memory_full_info().pss
+    except psutil.Error:  # it has ended meanwhile
+        return 0.0
+
+
+POLL_S = 0.05
+SLOW = 10  # polls: the proportional size costs the kernel a walk over all pages
 
 
 def bench_store(work: Path, items: int) -> None:
     folder = work / "million"
     shutil.rmtree(folder, ignore_errors=True)
     print(f"store: {items:,} items with empty payloads, 100 a part; two artifacts, the second but for its last {LEFT} parts")
-    print(f"  {'':<14}{'s':>8}{'CPU s':>8}{'MB':>7}{'MB, largest worker':>20}")
+    print(f"  {'':<14}{'s':>8}{'CPU s':>8}{'MB':>7}{'MB, largest worker':>20}{'MB, all':>9}")
     for name in ("build", "ls", "plan", "resume", "ls", "plan", "verify", "verify --deep"):
         command = [sys.executable, __file__, "--step", name, "--work", str(folder), "--items", str(items)]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-        if done.returncode:
-            raise SystemExit(f"{name} failed:\n{done.stdout}{done.stderr}")
-        took = json.loads(done.stdout.splitlines()[-1])
-        worker = f"{took['worker']:20.0f}" if name == "resume" else ""
-        print(f"  {name:<14}{took['wall']:8.1f}{took['cpu']:8.1f}{took['own']:7.0f}{worker}", flush=True)
+        with tempfile.TemporaryFile("w+") as output:
+            process = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
+            memory = watch_memory(process)
+            output.seek(0)
+            lines = output.read().splitlines()
+        if process.returncode:
+            raise SystemExit("\n".join([f"{name} failed:", *lines]))
+        took = json.loads(lines[-1])
+        row = f"  {name:<14}{took['wall']:8.1f}{took['cpu']:8.1f}{memory.own:7.0f}"
+        print(row + (f"{memory.worker:20.0f}{memory.all:9.0f}" if name == "resume" else ""), flush=True)
     print("  bar: resume under 30 s and 1,000 MB")
     shutil.rmtree(folder)
 
@@ -260,37 +304,67 @@ def bench_workers(work: Path, objects: int, scenes: int) -> None:
 # --- the paper's data -------------------------------------------------------------------------------------------------
 
 OF_OBJECTS, OF_SCENES = ("collect", "remesh", "decimate"), ("scene", "render", "shard")
-ITEM = re.compile(r"\S+ \S+ \S+: [0-9.]+ s, ([0-9.]+) s of CPU, ")
+ITEM = re.compile(r"\S+ \S+ (.+?): [0-9.]+ s, ([0-9.]+) s of CPU, (?:\d+ record\(s\)|rejected, )")  # an id may have spaces
+TAKEN_OVER = re.compile(r", taken over( from \S+)?$")
 
 
 def seconds_per_item(logs: Path) -> tuple[float, int]:
-    """Mean CPU seconds of an item, and of how many: from an artifact's logs, which tell a process' opening apart."""
-    told = (text for path in logs.glob("*.log") for text in path.read_text(errors="replace").splitlines())
-    seconds = [float(match[1]) for text in told if (match := ITEM.match(text)) and "taken over" not in text]
-    return (statistics.mean(seconds) if seconds else 0.0), len(seconds)
+    """Mean CPU seconds of an item, kept or rejected, and of how many: from an artifact's logs, which tell a process' opening
+    apart. Of an item that was computed twice (its worker died) the last time counts.
+    """
+    told = (text for path in sorted(logs.glob("*.log")) for text in path.read_text(errors="replace").splitlines())
+    seconds = {match[1]: float(match[2]) for text in told if (match := ITEM.match(text)) and not TAKEN_OVER.search(text)}
+    return (statistics.mean(seconds.values()) if seconds else 0.0), len(seconds)
 
 
-def measured(store: Store) -> dict[str, tuple[float, int, float, int]]:
-    """Stage -> (CPU seconds per item, of how many items, bytes per record, records), of the newest artifact of each."""
+class PerItem(NamedTuple):
+    """What an item that a stage keeps costs: its share of the CPU time of all that were tried, and the bytes of its records."""
+
+    seconds: float
+    measured: int  # items whose time the logs tell
+    bytes: float
+    kept: int
+
+
+def per_item(artifact: Artifact) -> PerItem:
+    outputs = artifact.manifest["outputs"]
+    kept = outputs["items"] - sum(outputs["rejects"].values())
+    seconds, items = seconds_per_item(artifact.path / "logs")
+    name = f"model: {artifact.stage}/{artifact.path.name}"
+    if not kept:
+        raise SystemExit(f"{name} kept none of its {outputs['items']} items: there is nothing to count by")
+    if not items:
+        raise SystemExit(
+            f"{name} tells no item's CPU time in its logs: it was made before logs did, or all was taken over from another "
+            f"artifact; force={artifact.stage} makes it again"
+        )
+    size = sum(part["bytes"] for part in outputs["parts"])  # files/ (cards, sheets) does not grow with the items
+    return PerItem(seconds * outputs["items"] / kept, items, size / kept, kept)
+
+
+def measured(store: Store) -> dict[str, PerItem]:
+    """Stage -> what an item costs, of the newest artifact of each."""
     found = {}
     for stage in OF_OBJECTS + OF_SCENES:
         artifacts: list[Artifact] = store.artifacts(stage)
         if not artifacts:
             raise SystemExit(f"model: {store.root} has no artifact of {stage}: make the line up to shard first")
-        outputs = artifacts[-1].manifest["outputs"]
-        seconds, items = seconds_per_item(artifacts[-1].path / "logs")
-        found[stage] = seconds, items, outputs["bytes"] / max(outputs["records"], 1), outputs["records"]
+        found[stage] = per_item(artifacts[-1])
     return found
 
 
-def make_sample(work: Path, scenes: int) -> Store:
-    """The line up to shard by the paper's settings, on few made-up objects."""
-    store = work / "sample"
+def sample_config(store: Path, scenes: int) -> dict[str, Any]:
+    """The line up to shard as the paper's first phase has it, but for few scenes of few made-up objects."""
     overrides = [
-        f"store={store}", "stage=shard", "collect.per_family=1", "remesh=released", "scene=paper", "scene.max_triangles=1536",
-        f"scene.count.train={scenes}", "scene.count.validation=1", "scene.count.test=1", "render=paper",
+        f"store={store}", "stage=shard", "experiment=paper_256", "collect=procedural", "collect.per_family=1",
+        f"scene.count.train={scenes}", "scene.count.validation=1", "scene.count.test=1",
     ]  # fmt: skip
-    runner.run_pipeline(compose(overrides), ["bench"])
+    return compose(overrides)
+
+
+def make_sample(work: Path, scenes: int) -> Store:
+    store = work / "sample"
+    runner.run_pipeline(sample_config(store, scenes), ["bench"])
     return Store(store)
 
 
@@ -311,20 +385,20 @@ def bench_model(work: Path, options: argparse.Namespace) -> None:
     store = Store(options.store) if options.store else make_sample(work, options.sample_scenes)
     found = measured(store)
     print(f"model: {options.objects:,} objects, {options.scenes:,} scenes of 4 views; per item as in {store.root}")
-    print(f"  {'':<9}{'CPU s':>12}{'items':>7}{'kB':>9}{'records':>9}{'of':>11}{'core-hours':>12}{'TB':>8}")
+    print(f"  {'':<9}{'CPU s':>12}{'timed':>7}{'kB':>9}{'kept':>9}{'of':>11}{'core-hours':>12}{'TB':>8}")
     hours: dict[str, float] = {}
     terabytes: dict[str, float] = {}
-    for stage, (seconds, items, size, records) in found.items():
+    for stage, (seconds, items, size, kept) in found.items():
         number = options.objects if stage in OF_OBJECTS else options.scenes
         hours[stage], terabytes[stage] = seconds * number / 3600, size * number / 1e12
-        per_item = f"{seconds:12.3f}{items:7d}{size / 1e3:9.1f}{records:9d}"
-        print(f"  {stage:<9}{per_item}{number:11,}{hours[stage]:12,.0f}{terabytes[stage]:8.2f}")
-    core_hours, everything, kept = sum(hours.values()), sum(terabytes.values()), terabytes["shard"]
+        cells = f"{seconds:12.3f}{items:7d}{size / 1e3:9.1f}{kept:9d}"
+        print(f"  {stage:<9}{cells}{number:11,}{hours[stage]:12,.0f}{terabytes[stage]:8.2f}")
+    core_hours, everything, shards = sum(hours.values()), sum(terabytes.values()), terabytes["shard"]
     days = core_hours / options.cores / 24 / options.use
     on_gpus = hours["render"] / options.gpu_cores / options.gpus / 24
     train = training_days(options.gpus)
     cores, node = core_hours / options.use * options.core_hour, train * 24 * options.node_hour
-    disk = options.tb_month * (everything * days / 30 + kept * options.months)
+    disk = options.tb_month * (everything * days / 30 + shards * options.months)
     print(f"  {'all':<57}{core_hours:12,.0f}{everything:8.2f}")
     print(f"  {options.cores:,} CPU cores: {days:.1f} days, {options.use:.0%} of them at work")
     print(f"  {options.gpus} GPUs of one node: render it in {on_gpus:.1f} days, a GPU taken for {options.gpu_cores:g} cores")
@@ -348,7 +422,7 @@ def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
     add("--per-family", type=int, default=4, help="workers: objects of each of 21 families to remesh")
     add("--worker-scenes", type=int, default=80, help="workers: scenes to render")
     add("--store", help="model: take figures from the artifacts of this store")
-    add("--sample-scenes", type=int, default=4, help="model: training scenes of the sample")
+    add("--sample-scenes", type=int, default=12, help="model: training scenes of the sample")
     add("--objects", type=int, default=800_000, help="model: objects (Objaverse 1.0 has about so many)")
     add("--scenes", type=int, default=2_000_000, help="model: scenes, of four views each")
     add("--cores", type=int, default=1000)

@@ -16,6 +16,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from model.config import ModelConfig
+from model.errors import InputError
 from model.renderformer import RenderFormer
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
@@ -61,15 +62,15 @@ def _check_shapes(config: ModelConfig, stored: Mapping[str, tuple[int, ...]], pa
     """That the file holds the network which the config asks for, before a byte of either is allocated."""
     layers = config.num_layers + config.view_transformer_n_layers
     if layers > len(stored):
-        raise ValueError(f"{path} holds {len(stored)} tensors, {CONFIG} asks for {layers} layers")
+        raise InputError(f"{path} holds {len(stored)} tensors, {CONFIG} asks for {layers} layers")
     with torch.device("meta"):
         own = {name: tuple(tensor.shape) for name, tensor in RenderFormer(config).state_dict().items()}
     for what, which in (("unknown", stored.keys() - own.keys()), ("missing", own.keys() - stored.keys())):
         if which:
-            raise ValueError(f"{path}: {what} parameter {', '.join(sorted(which))} for the network of {CONFIG}")
+            raise InputError(f"{path}: {what} parameter {', '.join(sorted(which))} for the network of {CONFIG}")
     for name, shape in stored.items():
         if shape != own[name]:
-            raise ValueError(f"{path}: {name} has shape {shape}, {CONFIG} asks for {own[name]}")
+            raise InputError(f"{path}: {name} has shape {shape}, {CONFIG} asks for {own[name]}")
 
 
 def load(folder: Path) -> tuple[RenderFormer, dict[str, str]]:
@@ -78,14 +79,14 @@ def load(folder: Path) -> tuple[RenderFormer, dict[str, str]]:
     config = ModelConfig.load(folder / CONFIG)
     path = folder / WEIGHTS
     if not path.is_file():
-        raise ValueError(f"{path} is missing: a checkpoint folder holds {CONFIG} and {WEIGHTS}")
+        raise InputError(f"{path} is missing: a checkpoint folder holds {CONFIG} and {WEIGHTS}")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             _check_shapes(config, {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}, path)  # noqa: SIM118
             state = {name: file.get_tensor(name) for name in sorted(file.keys())}
     except SafetensorError as error:
-        raise ValueError(f"{path} is not a safetensors file: {error}") from None
+        raise InputError(f"{path} is not a safetensors file: {error}") from None
     model = RenderFormer(config)
     model.load_state_dict(state)
     return model.eval(), {name: value for name, value in metadata.items() if name != "format"}

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from model.errors import InputError
+
 # Fields of the released format that have one supported value. They are kept so that folders are written back complete.
 FIXED: dict[str, Any] = {
     "activation": "swiglu",
@@ -84,45 +86,45 @@ class ModelConfig:
         for name, value in FIXED.items():
             given = getattr(self, name)
             if type(given) is bool is not type(value) or given != value:
-                raise ValueError(f"model.{name}={given!r} is not supported: only {value!r} is")
+                raise InputError(f"model.{name}={given!r} is not supported: only {value!r} is")
         for name in ("latent_dim", "num_heads", "dim_feedforward", "texture_encode_patch_size", "vn_pe_num_freqs",
                      "vertex_pe_num_freqs", "view_transformer_latent_dim", "view_transformer_n_layers",
                      "view_transformer_n_heads", "view_transformer_ffn_hidden_dim", "dpt_features"):  # fmt: skip
             if getattr(self, name) < 1:
-                raise ValueError(f"model.{name}={getattr(self, name)} must be at least 1")
+                raise InputError(f"model.{name}={getattr(self, name)} must be at least 1")
         for name in ("num_layers", "num_register_tokens"):
             if getattr(self, name) < 0:
-                raise ValueError(f"model.{name}={getattr(self, name)} must not be negative")
+                raise InputError(f"model.{name}={getattr(self, name)} must not be negative")
         if self.pe_type not in ("rope", "nerf"):
-            raise ValueError(f"model.pe_type={self.pe_type!r} is not supported: rope or nerf")
+            raise InputError(f"model.pe_type={self.pe_type!r} is not supported: rope or nerf")
         if self.texture_channels not in (10, 13):
-            raise ValueError(f"model.texture_channels={self.texture_channels} is not supported: 13, or 10 (no normal)")
+            raise InputError(f"model.texture_channels={self.texture_channels} is not supported: 13, or 10 (no normal)")
         if self.view_transformer_latent_dim != self.latent_dim:
-            raise ValueError(
+            raise InputError(
                 f"model.view_transformer_latent_dim={self.view_transformer_latent_dim} must equal "
                 f"model.latent_dim={self.latent_dim}: both stages share the triangle tokens"
             )
         for stage, heads in (("num_heads", self.num_heads), ("view_transformer_n_heads", self.view_transformer_n_heads)):
             if self.latent_dim % heads or self.latent_dim // heads % 2:
-                raise ValueError(f"model.{stage}={heads} must divide model.latent_dim={self.latent_dim} into even heads")
+                raise InputError(f"model.{stage}={heads} must divide model.latent_dim={self.latent_dim} into even heads")
         if self.pe_type == "rope":
             if self.vertex_pe_num_freqs % 2 or self.vertex_pe_num_freqs < 4:
-                raise ValueError(f"model.vertex_pe_num_freqs={self.vertex_pe_num_freqs} must be even and at least 4")
+                raise InputError(f"model.vertex_pe_num_freqs={self.vertex_pe_num_freqs} must be even and at least 4")
             if 9 * self.vertex_pe_num_freqs > self.latent_dim // self.num_heads:
-                raise ValueError(
+                raise InputError(
                     f"model.vertex_pe_num_freqs={self.vertex_pe_num_freqs} needs heads of at least "
                     f"{9 * self.vertex_pe_num_freqs} channels, there are {self.latent_dim // self.num_heads}"
                 )
             if self.view_pe_num_freqs < 4:
-                raise ValueError(f"model.view_transformer_n_heads={self.view_transformer_n_heads} leaves heads too narrow")
+                raise InputError(f"model.view_transformer_n_heads={self.view_transformer_n_heads} leaves heads too narrow")
         if self.use_dpt_decoder:
             if len(self.dpt_out_channels) != 4:
-                raise ValueError(f"model.dpt_out_channels={self.dpt_out_channels} must be four numbers")
+                raise InputError(f"model.dpt_out_channels={self.dpt_out_channels} must be four numbers")
             if self.dpt_features % 2:
-                raise ValueError(f"model.dpt_features={self.dpt_features} must be even")
+                raise InputError(f"model.dpt_features={self.dpt_features} must be even")
             layers = self.dpt_layers
             if len(layers) != 4 or not all(0 <= layer < self.view_transformer_n_layers for layer in layers):
-                raise ValueError(
+                raise InputError(
                     f"model.dpt_out_layers={self.dpt_out_layers} with {self.view_transformer_n_layers} decoder layers: "
                     "the DPT head reads four existing layers; use at least 4 layers or use_dpt_decoder=false"
                 )
@@ -150,14 +152,14 @@ class ModelConfig:
         known = [field.name for field in dataclasses.fields(cls)]
         unknown, missing = sorted(set(data) - set(known)), sorted(set(known) - set(data))
         if unknown:
-            raise ValueError(f"{where}: unknown field {', '.join(unknown)}: this code would not compute what it means")
+            raise InputError(f"{where}: unknown field {', '.join(unknown)}: this code would not compute what it means")
         if missing:
-            raise ValueError(f"{where}: field {', '.join(missing)} is missing: a released config.json names them all")
+            raise InputError(f"{where}: field {', '.join(missing)} is missing: a released config.json names them all")
         values = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
         try:
             return cls(**values)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{where}: {error}") from None
+            raise InputError(f"{where}: {error}") from None
 
     def to_dict(self) -> dict[str, Any]:
         """The released ``config.json``'s content."""
@@ -168,11 +170,11 @@ class ModelConfig:
         try:
             data = json.loads(path.read_text())
         except FileNotFoundError:
-            raise ValueError(f"{path} is missing: a checkpoint folder holds config.json and model.safetensors") from None
+            raise InputError(f"{path} is missing: a checkpoint folder holds config.json and model.safetensors") from None
         except ValueError as error:
-            raise ValueError(f"{path} is not JSON: {error}") from None
+            raise InputError(f"{path} is not JSON: {error}") from None
         if not isinstance(data, dict):
-            raise ValueError(f"{path} must hold one JSON object")
+            raise InputError(f"{path} must hold one JSON object")
         return cls.from_dict(data, str(path))
 
     def dumps(self) -> str:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import torch
 
+from model.errors import InputError
 from model.inputs import kept_cells
 from model.renderformer import RenderFormer
 
@@ -63,7 +64,7 @@ def aim_rays(model: RenderFormer, depth: float = 1.75) -> None:
     """Set the initial values in place. ``depth``: expected distance of what is seen, in scene units (section 3.3's cameras)."""
     config = model.config
     if config.pe_type != "rope" or not config.turn_to_cam_coord:
-        raise ValueError(
+        raise InputError(
             "train.informed_start=true needs rotary positions in the camera frame (model.pe_type=rope, "
             "model.turn_to_cam_coord=true); set train.informed_start=false for this model, or inputs"
         )

@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from model.errors import InputError
 from model.layers import Segments
 
 PATCH_NORMAL = (0.5, 0.5, 1.0)  # the released format's constant tangent-space normal
@@ -88,7 +89,7 @@ def textured_patches(reflectance: Tensor, material: Tensor, patch: int) -> Tenso
     """
     size = reflectance.shape[-1]
     if size % patch:
-        raise ValueError(
+        raise InputError(
             f"textures of {size} x {size} texels do not suit model.texture_encode_patch_size={patch}: it must divide {size}"
         )
     kept = kept_cells(size, reflectance.device).to(material.dtype)

@@ -14,6 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.errors import InputError
+
 # Per network: its layers as (output channels, kernel, stride, padding) or a pooling (kernel, stride), after which layers the
 # features are compared, and where the weights come from.
 VGG16_POOL, ALEX_POOL = (2, 2), (3, 2)
@@ -89,7 +91,7 @@ class LPIPS(nn.Module):
             if path is None or not path.is_file():
                 where = f"no folder is named (lpips_folder, or {FOLDER_VARIABLE})" if path is None else f"{path} does not exist"
                 without = "go without: train.lpips=0, evaluate.lpips=none"
-                raise ValueError(f"LPIPS needs {name}, but {where}: get it from {url}, or {without}")
+                raise InputError(f"LPIPS needs {name}, but {where}: get it from {url}, or {without}")
             loaded.append(torch.load(path, map_location="cpu", weights_only=True))
         features, linear = loaded
         metric = cls(network)
@@ -103,7 +105,7 @@ class LPIPS(nn.Module):
                 parameter.data.copy_(linear[f"lin{index}.model.1.weight"])
         except (KeyError, RuntimeError, ValueError) as error:
             names = f"{spec['features'][0]} and {spec['linear'][0]}"
-            raise ValueError(f"{folder}: {names} do not hold the published LPIPS weights: {error}") from None
+            raise InputError(f"{folder}: {names} do not hold the published LPIPS weights: {error}") from None
         return metric
 
     def _features(self, image: Tensor) -> list[Tensor]:

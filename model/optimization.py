@@ -9,6 +9,8 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
+from model.errors import InputError
+
 
 def schedule(step: int, steps: int, warmup: int, decay_steps: int | None, final: float) -> float:
     """Share of the highest learning rate at the 0-based step: linear warm-up, then cosine to ``final``."""
@@ -29,7 +31,7 @@ def optimizers(model: nn.Module, name: str, lr: float, muon_lr: float, weight_de
     if name == "adamw":
         hidden = set()
     elif name != "muon":
-        raise ValueError(f"optimizer={name!r} is unknown: adamw or muon")
+        raise InputError(f"optimizer={name!r} is unknown: adamw or muon")
     rest = [(key, p) for key, p in named if key not in hidden]
     decayed = [p for key, p in rest if p.ndim >= 2 and "token" not in key]
     plain = [p for key, p in rest if not (p.ndim >= 2 and "token" not in key)]

@@ -21,6 +21,7 @@ from torch.utils.checkpoint import checkpoint
 
 from model.config import ModelConfig
 from model.dpt import DPTHead
+from model.errors import InputError
 from model.inputs import Triangles, encode_emission, kept_cells, scenes_of
 from model.layers import (
     EMBEDDING_EPS,
@@ -267,7 +268,7 @@ class RenderFormer(nn.Module):
         patches = scenes.patches
         if scenes.material.shape[1] != channels or (patches is not None and patches.shape[1:] != (channels, patch, patch)):
             found = [tuple(x.shape) for x in (scenes.material, patches) if x is not None]
-            raise ValueError(
+            raise InputError(
                 f"material has shape {', '.join(map(str, found))}: the model reads {channels} channels, "
                 f"as one vector or a {patch} x {patch} patch per triangle"
             )
@@ -309,7 +310,7 @@ class RenderFormer(nn.Module):
         height, width = (resolution, resolution) if isinstance(resolution, int) else resolution
         multiple = self.config.resolution_multiple
         if min(height, width) < multiple or height % multiple or width % multiple:
-            raise ValueError(f"resolution {height}x{width} must be a multiple of {multiple} pixels for this model")
+            raise InputError(f"resolution {height}x{width} must be a multiple of {multiple} pixels for this model")
         return self.view_transformer(tokens, camera_to_world, fov_deg, height, width, keys_values)
 
     def forward(

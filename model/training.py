@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from model import checkpoint
 from model.checkpoint import replace
+from model.errors import InputError
 from model.flops import TRAINING, forward_flops, ideal_seconds, peak_flops
 from model.logs import TrainingLog
 from model.losses import LPIPS, image_loss, log_radiance
@@ -209,7 +210,7 @@ class _State:
             return False
         saved = torch.load(self.path, map_location="cpu", weights_only=True)
         if saved["identity"] != self._identity():
-            raise ValueError(f"{self.path} belongs to a training run of another configuration: give it another folder")
+            raise InputError(f"{self.path} belongs to a training run of another configuration: give it another folder")
         own = self.model.state_dict()
         self.model.load_state_dict({name: scatter(value, own[name]) for name, value in saved["model"].items()})
         for optimizer, state in zip(self.optimizers, saved["optimizers"], strict=True):
@@ -264,7 +265,7 @@ def fit(
     ``trained_with`` goes into the checkpoints. Returns steps, skipped, seconds, and the last and best validation's metrics.
     """
     if config.precision not in ("fp32", "mixed", "bf16"):
-        raise ValueError(f"precision={config.precision!r} is unknown: fp32, mixed or bf16")
+        raise InputError(f"precision={config.precision!r} is unknown: fp32, mixed or bf16")
     folder.mkdir(parents=True, exist_ok=True)
     model.to(group.device).train()
     model.view_transformer.gradient_leak = config.gradient_leak
@@ -323,7 +324,7 @@ def fit(
             state.skipped_in_a_row += 1
             if state.skipped_in_a_row >= PATIENCE:
                 scenes = ", ".join(str(i) for i in batch.get("ids", ())) or "not named"
-                raise ValueError(
+                raise InputError(
                     f"training stopped at step {step}: loss {loss_value}, gradient norm {norm_value}, not finite for "
                     f"{PATIENCE} steps in a row; look at the scenes of this batch ({scenes}), or try a smaller lr"
                 )

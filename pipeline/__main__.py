@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import sys
@@ -18,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from pipeline.errors import INTERRUPTED, STORAGE_ERRORS, status_of
+from pipeline.errors import INTERRUPTED, for_people, status_of
 from pipeline.hydra_config import CONF, compose, to_plain
 from pipeline.runner import run_pipeline, split_config
 from pipeline.sweep import (
@@ -30,6 +29,7 @@ from pipeline.sweep import (
     is_hydras,
     keys_of,
     live_with_the_sweep,
+    planned_keys,
     run_side_by_side,
 )
 
@@ -69,7 +69,7 @@ def guarded(work: Callable[[], None], debug: bool = False) -> int:
         with interruptible():
             work()
     except (ValueError, OSError) as error:
-        if debug or (isinstance(error, OSError) and error.errno not in STORAGE_ERRORS):
+        if debug or not for_people(error):
             raise
         print(f"error: {error}", file=sys.stderr, flush=True)
         return status_of(error)
@@ -101,7 +101,7 @@ def main(words: Sequence[str] | None = None) -> int:
             check_keys(task, root)
             run_pipeline(root, command, say)
         except ValueError as error:  # UserError, and what model/ says of bad input
-            if debug:
+            if debug or not for_people(error):
                 raise
             failures.append(status_of(error))
             print(f"error: {error}", file=sys.stderr, flush=True)
@@ -117,7 +117,7 @@ def main(words: Sequence[str] | None = None) -> int:
                     failures.extend(report(statuses))
                     return
                 overrides[:] = for_hydra(overrides)
-                os.environ[KEYS_VARIABLE] = json.dumps({job.name: keys_of(job.plan) for job in jobs})
+                os.environ[KEYS_VARIABLE] = planned_keys({job.name: keys_of(job.plan) for job in jobs})
             else:
                 split_config(compose(overrides))  # a bad override gets our message instead of Hydra's
         sys.argv = ["lightmill", *flags[:1], *overrides]

@@ -15,16 +15,19 @@ import socket
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
+from concurrent.futures.process import BrokenProcessPool
 from functools import cache, cached_property
 from typing import Annotated, Any, Literal
 
+from pebble import ProcessExpired
 from pydantic import Field, model_validator
 
 from pipeline.code import code_digest
 from pipeline.config import Limits, Section, StageConfig, nearest
-from pipeline.errors import UserError
-from pipeline.executor import open_pool, run_on
+from pipeline.errors import MachineError, UserError
+from pipeline.executor import PoolBroken, open_pool, run_on
 from pipeline.stage import load_system
 from pipeline.worker import PartResult, PartTask, running_file
 
@@ -45,6 +48,7 @@ IN_FLIGHT = 32  # parts that the scheduler holds at least; twice its threads onc
 TELL_EVERY_S = 60.0  # say so while no worker is there
 VISIBLE_S = 90.0  # how long a network file system may take to show what another machine wrote
 RETRIES = 2  # of a task that raised for a reason outside the items: a file system that was away, a pool that broke
+GONE = "the Dask scheduler is gone or was restarted: finished parts are kept, run again"
 
 
 class LocalExecutor(Section):
@@ -132,7 +136,16 @@ def _make_part(task: PartTask, limits: Limits, code: str, guard: str) -> tuple[P
         run_on(_pool(guard), iter([task]), 1, limits, results.append, lines.append)
     except UserError as error:
         return error, lines
+    except PoolBroken:  # raised, so that Dask tries again; this one can travel
+        raise _dying(here) from None
     return results[0], lines
+
+
+def _dying(host: str) -> MachineError:
+    return MachineError(
+        f"{host}: worker processes keep dying as they start: look at the machine's memory and at the Dask worker's log; "
+        "finished parts are kept, run again"
+    )
 
 
 def _environment(system: str, stage: str, config: StageConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
@@ -144,9 +157,24 @@ def _environment_of(guard: str, *arguments: Any) -> dict[str, Any] | UserError:
         return _pool(guard).schedule(_environment, args=arguments).result()
     except UserError as error:
         return error
+    except (BrokenProcessPool, ProcessExpired):
+        return _dying(socket.gethostname())
 
 
 # -- in the runner
+
+
+@contextlib.contextmanager
+def _while_the_scheduler_lives() -> Iterator[None]:
+    """Whatever a lost scheduler shows as is said in one way."""
+    try:
+        yield
+    except CancelledError:
+        raise MachineError(GONE) from None
+    except OSError as error:
+        if error.errno is None:  # Dask's own, of a connection; those of files have a number
+            raise MachineError(GONE) from error
+        raise
 
 
 class Cluster:
@@ -180,7 +208,13 @@ class Cluster:
             raise UserError(f"no Dask scheduler answers at executor.address={config.address}: {error}") from None
         guard = type("Guard", (_Guard, WorkerPlugin), {})(self._guard, config.threads)
         client.register_plugin(guard, name=self._guard)
-        self._stack.callback(client.unregister_worker_plugin, self._guard)
+
+        def leave() -> None:
+            if client.status == "running":  # a scheduler that is gone is told nothing, and must not hide why the run ends
+                with contextlib.suppress(OSError):
+                    client.unregister_worker_plugin(self._guard)
+
+        self._stack.callback(leave)
         self._out(f"dask: scheduler {client.scheduler.address}, dashboard {client.dashboard_link}")
         return client
 
@@ -198,6 +232,7 @@ class Cluster:
         cluster.adapt(minimum=self._config.workers, maximum=self._config.workers)  # scale() would not replace lost ones
         return cluster
 
+    @_while_the_scheduler_lives()
     def environment(self, system: str, stage: str, config: StageConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
         """The stage's runtime choices as a worker sees them: the machine that starts a run may have another GPU, or none."""
         future = self._client.submit(_environment_of, self._guard, system, stage, config, previous, pure=False)
@@ -206,6 +241,7 @@ class Cluster:
             raise result
         return result
 
+    @_while_the_scheduler_lives()
     def run_parts(
         self,
         tasks: Iterable[PartTask],
@@ -259,10 +295,10 @@ class Cluster:
                 done = wait(futures, timeout=2.0, return_when="FIRST_COMPLETED").done
                 lost = [future for future in done if future.cancelled()]
                 if lost:
-                    raise UserError("the Dask scheduler is gone or was restarted: finished parts are kept, run again")
+                    raise MachineError(GONE)
                 return list(done)
             if self._client.status not in ("running", "connecting"):
-                raise UserError("the Dask scheduler is gone: finished parts are kept, run again")
+                raise MachineError(GONE)
             if time.monotonic() - told > TELL_EVERY_S and not self._client.nthreads():
                 log(f"dask: waiting, {self._client.scheduler.address} has no worker")
                 told = time.monotonic()
@@ -274,7 +310,8 @@ def _wait_until_visible(task: PartTask) -> None:
     until = time.monotonic() + VISIBLE_S
     while not marker.exists():
         if time.monotonic() > until:
-            raise UserError(
-                f"{marker} was written by a worker and is not to be seen here: is the store on one shared file system?"
+            raise MachineError(
+                f"{marker} was written by a worker and is not to be seen here: is the store on one shared file system? "
+                "Finished parts are kept, run again"
             )
         time.sleep(0.5)

@@ -7,6 +7,7 @@ right one; ``runtime`` fields (workers, devices, logging) stay out of keys.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +44,24 @@ class Limits(Section):
     wall_s: float = 1800.0  # seconds on the clock, for what hangs without computing
     memory_gb: float = 8.0  # resident memory of the worker
 
+    def exceed(self, reject: Mapping[str, Any]) -> bool:
+        """Whether one of these is higher than the limit that the rejected item ran into, if it did."""
+        return any(getattr(self, name) > limit for name, limit in reject.get("limit", {}).items())
+
+
+class StageLimits(Section):
+    """``Limits`` as a config gives them; None: the stage's own."""
+
+    cpu_s: float | None = Field(None, gt=0)
+    wall_s: float | None = Field(None, gt=0)
+    memory_gb: float | None = Field(None, gt=0)
+
 
 class StageConfig(Section):
     """Base of every stage's config."""
 
     workers: int | None = runtime(None, ge=1)  # worker processes of this stage; None: the run's
-    limits: dict[str, float] = runtime({})  # cpu_s, wall_s, memory_gb of one item; what is not given: the stage's own
+    limits: StageLimits = runtime(StageLimits())  # of one item
     max_reject_share: float = runtime(0.5, ge=0, le=1)  # above this share of rejected items the stage fails
 
 

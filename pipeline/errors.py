@@ -12,7 +12,8 @@ STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EI
 class UserError(ValueError):
     """Something the user can mend. The message says what was given, what was expected and what to do.
 
-    Commands print it as one line and exit with ``status``; ``--debug`` shows the traceback.
+    Commands print it as one line and exit with ``status``; ``--debug`` shows the traceback. A package that must not know the
+    engine has a ValueError of its own with a ``status``. Any other exception is a bug: a traceback, and status 1.
     """
 
     status = 2
@@ -58,8 +59,15 @@ class Reject(Exception):
         return f"{self.reason}: {self.detail}" if self.detail else self.reason
 
 
+def for_people(error: BaseException) -> bool:
+    """Whether the error's message says to a person what is wrong; else it is a bug."""
+    if isinstance(error, OSError):
+        return error.errno in STORAGE_ERRORS
+    return isinstance(error, ValueError) and isinstance(getattr(error, "status", None), int)
+
+
 def status_of(error: BaseException) -> int:
     """The exit status of a command that stops with this error."""
-    if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
-        return MachineError.status
-    return getattr(error, "status", UserError.status if isinstance(error, (ValueError, OSError)) else 1)
+    if not for_people(error):
+        return 1
+    return MachineError.status if isinstance(error, OSError) else error.status  # type: ignore[attr-defined]

@@ -1,7 +1,8 @@
 """Running parts in local processes that may die: spawned workers, limits per item, one retry alone, then a reject.
 
 An item that brings its worker down (crash, CPU time, wall time or memory over the limit) is tried once more, first in a
-fresh process; if that dies too the item is rejected as ``crash``, ``time`` or ``memory``, marked as machine-dependent.
+fresh process; if that dies too the item is rejected as ``crash``, ``time`` or ``memory``, marked as machine-dependent and with
+the limit that it ran into: a run with a higher one tries it again.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import resource_tracker
@@ -37,6 +38,7 @@ from pipeline.worker import (
     write_log,
 )
 
+REASONS = ("crash", "time", "memory")  # of rejects that are the machine's doing
 POLL_S = 0.25
 MAX_POOLS = 8  # that break as a whole
 MAX_UNEXPLAINED = 4  # deaths of a part's worker beyond what its items can explain
@@ -140,7 +142,7 @@ def run_on(
 ) -> None:
     """Run all tasks on the pool's ``workers``, at most twice as many at a time, and hold their items to the limits."""
     flying: dict[Any, PartTask] = {}
-    verdicts: dict[str, tuple[str, str]] = {}  # part key -> (reason, detail) of the kill that we made ourselves
+    verdicts: dict[str, Mapping[str, Any]] = {}  # part key -> reject, for the kills that we made ourselves
     deaths: dict[str, int] = {}  # part key -> workers that died over it
     exhausted = False
 
@@ -181,7 +183,7 @@ def run_on(
 
 
 def _after_death(
-    task: PartTask, death: ProcessExpired, verdict: tuple[str, str] | None, log: Callable[[str], None]
+    task: PartTask, death: ProcessExpired, verdict: Mapping[str, Any] | None, log: Callable[[str], None]
 ) -> PartTask:
     """The task to submit after its worker died: the suspect first, or rejected when it was the suspect already."""
     path = running_file(task.draft, task.part_key)
@@ -192,14 +194,15 @@ def _after_death(
         log(f"{task.stage}: a worker died (exit code {death.exitcode}) outside any item; its part starts again")
         return task
     item = state["item"]
-    reason, detail = verdict or ("crash", f"worker died with exit code {death.exitcode}")
-    what = f"{item}: {detail}; " + (f"rejected as {reason}" if task.first == item else "trying it once more, alone")
+    verdict = verdict or {"reason": "crash", "detail": f"worker died with exit code {death.exitcode}"}
+    what = f"{item}: {verdict['detail']}; "
+    what += f"rejected as {verdict['reason']}" if task.first == item else "trying it once more, alone"
     log(f"{task.stage}: {what}")
     with contextlib.suppress(OSError):
         write_log(task.draft, task.part_key, what)
     if task.first != item:
         return dataclasses.replace(task, first=item)
-    killed = {**task.killed, item: {"reason": reason, "detail": detail, "machine": True}}
+    killed = {**task.killed, item: {**verdict, "machine": True}}
     return dataclasses.replace(task, first=None, killed=killed)
 
 
@@ -210,7 +213,7 @@ def _read_running(path: Path) -> dict[str, Any] | None:
         return None
 
 
-def _hold_to_limits(task: PartTask, limits: Limits, verdicts: dict[str, tuple[str, str]]) -> None:
+def _hold_to_limits(task: PartTask, limits: Limits, verdicts: dict[str, Mapping[str, Any]]) -> None:
     state = _read_running(running_file(task.draft, task.part_key))
     if state is None:
         return
@@ -225,13 +228,13 @@ def _hold_to_limits(task: PartTask, limits: Limits, verdicts: dict[str, tuple[st
         return
     wall_s = time.monotonic() - state["monotonic"]
     if cpu_s > limits.cpu_s:
-        verdict = "time", f"over {limits.cpu_s:g} s of CPU time"
+        reason, limit, detail = "time", "cpu_s", f"over {limits.cpu_s:g} s of CPU time"
     elif wall_s > limits.wall_s:
-        verdict = "time", f"over {limits.wall_s:g} s on the clock"
+        reason, limit, detail = "time", "wall_s", f"over {limits.wall_s:g} s on the clock"
     elif memory_gb > limits.memory_gb:
-        verdict = "memory", f"over {limits.memory_gb:g} GB of memory"
+        reason, limit, detail = "memory", "memory_gb", f"over {limits.memory_gb:g} GB of memory"
     else:
         return
-    verdicts[task.part_key] = verdict
+    verdicts[task.part_key] = {"reason": reason, "detail": detail, "limit": {limit: getattr(limits, limit)}}
     with contextlib.suppress(ProcessLookupError):
         os.kill(state["pid"], signal.SIGKILL)

@@ -33,9 +33,10 @@ from pipeline.errors import (
     MachineError,
     TooManyRejects,
     UserError,
+    for_people,
     status_of,
 )
-from pipeline.executor import run_parts
+from pipeline.executor import REASONS, run_parts
 from pipeline.keys import SCHEME, canonical, digest_of, digest_of_plain
 from pipeline.progress import Progress, duration
 from pipeline.stage import Item, MapStage, RunStage, Stage, System, load_system
@@ -52,6 +53,7 @@ class RunConfig(Section):
     seed: int = 0  # stages that draw random numbers refer to it
     store: str = "store"
     force: tuple[str, ...] = ()  # stages to compute again although their artifacts exist
+    retry: tuple[str, ...] = ()  # stages of whose artifacts only what a crash or a limit rejected is computed again
     plan: bool = False  # print the plan and stop
     workers: int | Literal["auto"] = Field("auto")  # worker processes; auto: one per core; 0: none, in this process
     jobs: int | None = Field(None, ge=1)  # of a sweep at a time, each in a process of its own; None: one by one in this one
@@ -62,7 +64,7 @@ class RunConfig(Section):
 def split_config(root: Mapping[str, Any]) -> tuple[RunConfig, System, dict[str, Any]]:
     """The composed config as (the engine's part, the system, stage name -> its section)."""
     engine = {name: value for name, value in root.items() if name in RunConfig.model_fields}
-    for name in ("stage", "force"):
+    for name in ("stage", "force", "retry"):
         if name in engine:
             value = engine[name]
             engine[name] = value.split(",") if isinstance(value, str) else value or []
@@ -74,7 +76,7 @@ def split_config(root: Mapping[str, Any]) -> tuple[RunConfig, System, dict[str, 
     for name in root:
         if name not in known:
             raise UserError(f"{name} is unknown{nearest(name, known)}")
-    for name in (*run.stage, *run.force):
+    for name in (*run.stage, *run.force, *run.retry):
         system.stage(name)
     return run, system, {name: root[name] for name in root if name in system.modules}
 
@@ -159,9 +161,10 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
     hashes = HashCache(store.root / ".cache" / "hashes.json")
     plan = make_plan(run, system, sections, hashes)
     hashes.save()
-    for name in run.force:
-        if name not in plan:
-            raise UserError(f"force={name}: the stage is not among those that stage={','.join(run.stage)} needs")
+    for setting, names in (("force", run.force), ("retry", run.retry)):
+        for name in names:
+            if name not in plan:
+                raise UserError(f"{setting}={name}: the stage is not among those that stage={','.join(run.stage)} needs")
     artifacts: dict[str, Artifact | None] = {}
     damaged: dict[str, Damaged] = {}
     for name, planned in plan.items():
@@ -171,12 +174,13 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
                 store.touch(planned.key)  # not only at its turn, which may be days away: gc must know
         except Damaged as error:
             artifacts[name], damaged[name] = None, error
+    run = run.model_copy(update={"retry": tuple(name for name in run.retry if _machine_rejects(artifacts[name]))})
     todo = _todo(run, plan, artifacts)
     for name, error in damaged.items():
         if name in todo and name not in run.force:
             raise error
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and run.force:
-        raise UserError(f"force={','.join(run.force)} needs a process of its own: run it without torchrun")
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and (again := (*run.force, *run.retry)):
+        raise UserError(f"force or retry={','.join(again)} needs a process of its own: run it without torchrun")
     if int(os.environ.get("RANK", "0")) > 0 and not run.plan:  # one of several processes that torchrun started
         return _follow(plan, todo, store)
     with Cluster(run.executor, out) if isinstance(run.executor, DaskExecutor) else contextlib.nullcontext() as cluster:
@@ -195,6 +199,8 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
             elif artifact is not None:
                 store.touch(artifact.key)
                 out(f"{_label(system, name)} up to date {_describe(artifact)}")
+                for line in _note_rejects(artifact, command):
+                    out(line)
                 if artifact.codes != [code_digest(system, name)]:
                     out(f"   note: the code of {name} has changed since, its version has not (force={name} recomputes)")
             else:
@@ -225,16 +231,45 @@ def _todo(run: RunConfig, plan: Mapping[str, Planned], artifacts: Mapping[str, A
     """Stages to compute: targets that are missing, what they lack upstream, and what is forced."""
     todo: set[str] = set()
 
-    def need(name: str, forced: bool) -> None:
-        if name in todo or (artifacts[name] is not None and not forced):
+    again = {*run.force, *run.retry}
+
+    def need(name: str) -> None:
+        if name in todo or (artifacts[name] is not None and name not in again):
             return
         todo.add(name)
         for parent in plan[name].stage.reads(plan[name].config):
-            need(parent, parent in run.force)
+            need(parent)
 
-    for name in (*run.force, *run.stage):
-        need(name, name in run.force)
+    for name in (*again, *run.stage):
+        need(name)
     return todo
+
+
+def _machine_rejects(artifact: Artifact | None) -> list[dict[str, Any]]:
+    """Rejects of the artifact that are the machine's doing; its listing is read only where there may be any."""
+    if artifact is None or not artifact.manifest["outputs"]["rejects"].keys() & set(REASONS):
+        return []
+    return [reject for reject in artifact.rejects() if reject.get("machine")]
+
+
+def _note_rejects(artifact: Artifact, command: Sequence[str]) -> Iterator[str]:
+    """Says of machine rejects what to do: an undisturbed run would have made records of them."""
+    try:
+        rejects = _machine_rejects(artifact)
+    except Damaged:  # nobody reads it now
+        return
+    if rejects:
+        name = artifact.stage
+        counts = Counter(reject["reason"] for reject in rejects)
+        listed = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
+        met: dict[str, float] = {}
+        for reject in rejects:
+            for limit, value in reject.get("limit", {}).items():
+                met[limit] = max(value, met.get(limit, 0.0))
+        raised = "".join(f", {name}.limits.{limit}=N allows more than {value:g}" for limit, value in sorted(met.items()))
+        yield f"   note: the machine rejected {len(rejects)} of its items ({listed})"
+        again = [word for word in command if word != "plan=true"]
+        yield f"   note: to try them again: {shlex.join([*again, f'retry={name}'])}{raised}"
 
 
 def _label(system: System, name: str) -> str:
@@ -264,14 +299,14 @@ def make_artifact(
 ) -> Artifact:
     """Compute one artifact and commit it. ``plan``: the whole run's stages, for its state; ``adopt`` fills a repair's draft."""
     name, key = planned.name, planned.key
-    forced = name in run.force
+    forced, retried = name in run.force, name in run.retry
     claim = store.claim(name, key)
     draft_path = store.draft_path(name, key)
     state: RunState | None = None
     began = time.monotonic()
     try:
         made = _take(claim, store, planned, forced, lambda text: out(f"{_label(system, name)} {text}"))
-        if made is not None:
+        if made is not None and not (retried and _machine_rejects(made)):
             return made
 
         def say(text: str) -> None:
@@ -289,6 +324,8 @@ def make_artifact(
         old_digest = _digest_of(store, name, key)
         if adopt is not None:
             adopt(draft)
+        if made is not None and draft.environment() is None:
+            draft.set_environment(made.manifest["environment"])  # its records are taken over
         environment = draft.environment()
         if cluster is not None and isinstance(planned.stage, MapStage):
             environment = cluster.environment(run.system, name, planned.config, environment)
@@ -320,9 +357,9 @@ def make_artifact(
             "finished": time.time(),
             "seconds": time.monotonic() - began,
         }
-        artifact = store.commit(draft, planned.stage.slug(planned.config), manifest, replace=forced)
+        artifact = store.commit(draft, planned.stage.slug(planned.config), manifest, replace=forced or retried)
     except BaseException as error:
-        if not (draft_path / DRAFT).exists() and isinstance(error, Exception) and not forced:
+        if not (draft_path / DRAFT).exists() and isinstance(error, Exception) and not (forced or retried):
             made = store.find(name, key)
             if made is not None:  # another process took the claim from us, and was faster
                 shutil.rmtree(draft_path, ignore_errors=True)
@@ -330,22 +367,24 @@ def make_artifact(
                 return made
         if isinstance(error, OSError) and (error.errno in STORAGE_ERRORS or str(error.filename).startswith(f"{store.root}/")):
             where = f" ({error.filename})" if error.filename else ""
+            remedy = "make room or mend the disk, and" if error.errno in STORAGE_ERRORS else "--debug says who asked for it;"
             error = MachineError(
-                f"{name}: the store at {store.root} cannot be written: {error.strerror}{where}. Finished parts are kept: make "
-                "room or mend the disk, and run the same command again"
+                f"{name}: the store at {store.root} cannot be read or written: {error.strerror}{where}. Finished parts are "
+                f"kept: {remedy} run the same command again"
             )
+        if isinstance(error, Exception) and not for_people(error):
+            error.add_note(f"in stage {name} ({draft_path})")
         if state is not None:
             with contextlib.suppress(OSError):
                 draft.sweep()  # on a full disk it is room to go on with
             interrupted = isinstance(error, KeyboardInterrupt)
-            state.end(
-                INTERRUPTED if interrupted else status_of(error), "interrupted" if interrupted else str(error) or repr(error)
-            )
+            message = "interrupted" if interrupted else str(error) if for_people(error) else repr(error)
+            state.end(INTERRUPTED if interrupted else status_of(error), message)
         raise error
     finally:
         claim.release()
     verdict = ""
-    if forced and old_digest is not None:
+    if (forced or retried) and old_digest is not None:
         verdict = "  equal to before" if artifact.digest == old_digest else "  DIFFERENT from before"
         if artifact.digest != old_digest:
             verdict += f" ({old_digest[:12]} is now {artifact.digest[:12]}); later stages still hold what was made from the old"
@@ -411,34 +450,40 @@ def _run_map(
         part_key = digest_of({"group": group, "items": part_item_keys})
         parts[part_key] = group, tuple(items[index] for index in indices), part_item_keys
     markers, damaged = draft.sound_markers({key: [item.id for item in part_items] for key, (_, part_items, _) in parts.items()})
+    limits = Limits(**{**stage.limits, **config.limits.model_dump(exclude_none=True)})
     tasks: list[PartTask] = []
-    total, reused = len(items), 0
+    fresh: dict[str, int] = {}  # part key -> items to compute
+    total, again = len(items), 0
     for part_key, (group, part_items, part_item_keys) in parts.items():
         marker = markers[part_key]
-        if marker is not None:
-            reused += len(part_items)
+        allowed = {reject["item"] for reject in marker["rejects"] if limits.exceed(reject)} if marker is not None else set()
+        if marker is not None and not allowed:
             state.add_rejects(Counter(reject["reason"] for reject in marker["rejects"]))
             continue
+        again += len(allowed)
+        wanted = zip(part_items, part_item_keys, strict=True)
         reuse = {
-            item.id: donors[item_key] for item, item_key in zip(part_items, part_item_keys, strict=True) if item_key in donors
+            item.id: donors[item_key] for item, item_key in wanted if item_key in donors and (not allowed or item.id in allowed)
         }
-        reused += len(reuse)
+        fresh[part_key] = len(allowed or part_items) - len(reuse)
         tasks.append(
             PartTask(
                 run.system, planned.name, planned.key, config, inputs, environment, draft.path,
-                part_key, group, part_items, part_item_keys, reuse,
+                part_key, group, part_items, part_item_keys, reuse, limits=limits,
             )
         )  # fmt: skip
+    reused = total - sum(fresh.values())
     if not forced:
         sources: dict[Path, _Source] = {}
         tasks = [task for task in tasks if not _link_whole(task, sources, draft)]
     label = _label(system, planned.name)
+    if again:
+        out(f"{label} {again} item(s) that lower limits rejected before are tried again")
     if damaged:
         out(f"{label} {damaged} finished part(s) of the interrupted run are damaged and made again")
     out(f"{label} running    {total} items" + (f", {reused} of them already there" if reused else ""))
     progress = Progress(f"{label}", total, reused)
     failed: list[tuple[str, str, Path]] = []
-    fresh = {task.part_key: len(task.items) - len(task.reuse) for task in tasks}
     state.update(now=True, parts=len(parts), total=total, reused=reused, done=reused)
 
     def on_result(result: PartResult) -> None:
@@ -450,7 +495,6 @@ def _run_map(
         state.add_rejects(result.rejects)
         state.update(now=bool(result.failed), done=progress.done)
 
-    limits = parse(Limits, {**stage.limits, **config.limits}, f"{planned.name}.limits")
     workers = config.workers if config.workers is not None else run.workers
     cores = os.cpu_count() or 1
     workers = cores if workers == "auto" else workers

@@ -122,7 +122,10 @@ class _Records:
 
         A whole record is checked against its digest, so that nothing is made from damaged bytes.
         """
-        row = self.row(record_id)
+        return self.read_row(self.row(record_id), only)
+
+    def read_row(self, row: Row, only: Collection[str] | None = None) -> Record:
+        """The record that the row tells the place of."""
         path = self.part_path(row.part)
         try:
             with open(path, "rb") as file:

@@ -7,6 +7,8 @@ cores. Either way a job whose keys are no longer those of the plan stops: Hydra 
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import os
 import signal
@@ -28,7 +30,11 @@ from pipeline.runner import Planned, make_plan, run_pipeline, split_config
 from pipeline.store import HashCache, Store
 from pipeline.worker import die_with_parent
 
-KEYS_VARIABLE = "LIGHTMILL_SWEEP_KEYS"  # JSON: a job's overrides -> its keys, for the jobs of one sweep
+# The jobs of one sweep: of each a hash of its overrides and one of its keys. It goes where the jobs go, to other machines
+# too, and it is small: Linux starts no process with a variable of 128 KiB.
+KEYS_VARIABLE = "LIGHTMILL_SWEEP_KEYS"
+HASH_LETTERS = 8
+MAX_JOBS = 8000
 JOB_VARIABLE = "LIGHTMILL_SWEEP_JOB"  # set in the processes of jobs that run side by side
 
 Plan = Mapping[str, Planned]
@@ -100,10 +106,26 @@ def sweep_keys(overrides: Sequence[str]) -> dict[str, dict[str, str]]:
     return {job.name: keys_of(job.plan) for job in expand(overrides)}
 
 
+def _hash(text: str) -> str:
+    return base64.urlsafe_b64encode(hashlib.blake2b(text.encode(), digest_size=HASH_LETTERS * 3 // 4).digest()).decode()
+
+
+def _entry(task: str, keys: Mapping[str, str]) -> str:
+    return _hash(task) + _hash(json.dumps(keys, sort_keys=True))
+
+
+def planned_keys(keys: Mapping[str, Mapping[str, str]]) -> str:
+    """KEYS_VARIABLE for jobs of these overrides and keys."""
+    if len(keys) > MAX_JOBS:
+        raise UserError(f"a sweep of {len(keys)} jobs: at most {MAX_JOBS} at a time, so leave out some values")
+    return "".join(_entry(task, own) for task, own in keys.items())
+
+
 def check_keys(task: str, root: Mapping[str, Any]) -> None:
     """UserError if the job ``task`` is one of a sweep that planned other keys for it."""
-    expected = json.loads(os.environ.get(KEYS_VARIABLE, "{}")).get(task)
-    if expected is not None and expected != keys_of(plan_of(root)):
+    told = os.environ.get(KEYS_VARIABLE, "")
+    known = {told[start : start + 2 * HASH_LETTERS] for start in range(0, len(told), 2 * HASH_LETTERS)}
+    if any(entry.startswith(_hash(task)) for entry in known) and _entry(task, keys_of(plan_of(root))) not in known:
         raise UserError(f"the config or a source file changed after the sweep began: job {task!r} has other keys now")
 
 
@@ -153,7 +175,7 @@ def run_side_by_side(
         words = list(job.words)
         if job.root["workers"] == "auto":
             words = [word for word in words if not word.startswith("workers=")] + [f"workers={cores}"]
-        keys = json.dumps({" ".join(words): keys_of(job.plan)})
+        keys = planned_keys({" ".join(words): keys_of(job.plan)})
         process = subprocess.Popen(
             [sys.executable, "-m", "pipeline", *words, *hydra_words],
             env=environment | {KEYS_VARIABLE: keys}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -161,7 +183,8 @@ def run_side_by_side(
         assert process.stdout is not None
         for line in process.stdout:
             say(line.rstrip("\n"))
-        return process.wait()
+        status = process.wait()
+        return status if status >= 0 else 128 - status  # killed by a signal: the shells' number
 
     pool = ThreadPoolExecutor(at_once)
     try:
@@ -180,14 +203,16 @@ def live_with_the_sweep() -> None:
 def _complete(job: Job) -> bool:
     run = split_config(job.root)[0]
     store = Store(run.store)
-    return not run.force and all(store.find(name, job.plan[name].key) is not None for name in run.stage)
+    return not run.force and not run.retry and all(store.find(name, job.plan[name].key) is not None for name in run.stage)
 
 
 def _make_shared(job: Job, shared: Mapping[str, str], command: Sequence[str], out: Callable[[str], None]) -> None:
     """What all jobs read, once and with all workers, instead of by one job for which the others wait."""
     run = split_config(job.root)[0]
-    forced = [name for name in run.force if name in shared]
-    if forced:
-        raise UserError(f"force={','.join(forced)}: all jobs of the sweep share it; force it by itself, then run the sweep")
+    for setting, names in (("force", run.force), ("retry", run.retry)):
+        if ours := [name for name in names if name in shared]:
+            raise UserError(
+                f"{setting}={','.join(ours)}: all jobs of the sweep share it; do that by itself, then run the sweep"
+            )
     read = {parent for name in shared for parent in job.plan[name].stage.reads(job.plan[name].config)}
-    run_pipeline({**job.root, "stage": [name for name in shared if name not in read], "force": []}, command, out)
+    run_pipeline({**job.root, "stage": [name for name in shared if name not in read], "force": [], "retry": []}, command, out)

@@ -24,7 +24,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from pipeline.config import Limits
 from pipeline.errors import STORAGE_ERRORS, Damaged, Reject, UserError
+from pipeline.listing import Row
 from pipeline.stage import Item, MapStage, Record, load_system
 from pipeline.store import Artifact, Draft
 
@@ -65,6 +67,7 @@ class PartTask:
     reuse: Mapping[str, Reuse] = field(default_factory=dict)
     first: str | None = None  # the item to try first, alone in a fresh process: it was at work when the last one died
     killed: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # items that died twice: their rejects
+    limits: Limits = Limits()  # of an item; whoever runs the part holds it to them, here they tell what to try again
 
 
 @dataclass(frozen=True)
@@ -205,7 +208,9 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
         watch.start()
         reuse = task.reuse.get(item.id)
         try:
-            if reuse is None:
+            if item.id in kept:
+                result: list[Record] | Reject | _Failure = [draft.read_row(row) for row in kept[item.id]]
+            elif reuse is None:
                 result = compute(item)
             elif reuse.reject is not None:
                 result = Reject(reuse.reject["reason"], reuse.reject["detail"])
@@ -221,14 +226,22 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
         if isinstance(result, _Failure):
             what = f"FAILED\n{result.trace.rstrip()}"
         where = "" if reuse is None else ", taken over" + (f" from {reuse.artifact.name}" if reuse.artifact else "")
+        if item.id in kept:
+            where = ", taken over from before"
         say(f"{item.id}: {watch}, {what}{where}")
         return result
 
     say(f"{len(task.items)} items of {task.stage} {task.group or '-'}: process {os.getpid()} on {socket.gethostname()}")
     finished = draft.sound_markers({task.part_key: [item.id for item in task.items]})[0][task.part_key]
-    if finished is not None:
+    if finished is not None and not any(task.limits.exceed(reject) for reject in finished["rejects"]):
         say("finished already, by a worker that died before it could say so")
         return PartResult(task.part_key, len(task.items), Counter(reject["reason"] for reject in finished["rejects"]))
+    kept: dict[str, list[Row]] = {}
+    rejected = dict(task.killed)
+    if finished is not None:  # under lower limits: what they rejected is tried again, the rest stays as it is
+        for row in map(Row.from_json, (draft.marker(task.part_key) or {"rows": []})["rows"]):
+            kept.setdefault(row.item, []).append(row)
+        rejected = {reject["item"]: reject for reject in finished["rejects"] if not task.limits.exceed(reject)} | rejected
     writer = draft.open_part()
     rejects: list[dict[str, Any]] = []
     failed: list[tuple[str, str]] = []
@@ -236,8 +249,8 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
         early = {item.id: attempt(item) for item in task.items if item.id == task.first}
         for item, item_key in zip(task.items, task.item_keys, strict=True):
             row = {"item": item.id, "group": item.group, "item_key": item_key}
-            if item.id in task.killed:
-                rejects.append({**row, **task.killed[item.id]})
+            if item.id in rejected:
+                rejects.append({**row, **rejected[item.id]})
                 continue
             result = early.pop(item.id) if item.id in early else attempt(item)
             if isinstance(result, _Failure):

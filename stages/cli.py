@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.commands import add_commands
-from pipeline.errors import INTERRUPTED, UserError, status_of
+from pipeline.errors import INTERRUPTED, UserError, for_people, status_of
 
 PROGRAM = "lightmill"
 
@@ -342,10 +342,11 @@ def main(words: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0
     except (ValueError, OSError) as error:
-        if arguments.debug:
+        path = isinstance(error, OSError) and arguments.function not in (command_run, command_import)  # one that was given
+        if arguments.debug or not (path or for_people(error)):
             raise
         print(f"error: {error}", file=sys.stderr)
-        return status_of(error)
+        return status_of(error) if for_people(error) else UserError.status
     except KeyboardInterrupt:
         return INTERRUPTED
 

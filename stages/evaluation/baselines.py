@@ -16,6 +16,7 @@ from functools import partial
 
 import numpy as np
 
+from pipeline.errors import UserError
 from stages.metrics import METRICS, Metric, measure_all
 from stages.tonemap import clamp, log_decode, log_encode, tone_map, tone_unmap
 
@@ -76,7 +77,7 @@ def mean_images(blocks: Iterable[np.ndarray], limit: int) -> dict[str, np.ndarra
             held = np.empty((limit, *block.shape[1:]), dtype=np.float16)
             sums = {name: np.zeros(block.shape[1:]) for name in ("linear", "tone_mapped")}
         if block.shape[1:] != held.shape[1:]:
-            raise ValueError(f"training images of {block.shape[1:]} and {held.shape[1:]}: a mean image needs one size")
+            raise UserError(f"training images of {block.shape[1:]} and {held.shape[1:]}: a mean image needs one size")
         held[count : count + len(block)] = SPACES["log"].encode(block)
         for name, total in sums.items():
             total += SPACES[name].encode(block).sum(axis=0, dtype=np.float64)
@@ -84,7 +85,7 @@ def mean_images(blocks: Iterable[np.ndarray], limit: int) -> dict[str, np.ndarra
         if count >= limit:
             break
     if not count:
-        raise ValueError("there is no training image to average")
+        raise UserError("there is no training image to average")
     encoded = {name: total / count for name, total in sums.items()}
     # Row by row: the median of half floats is taken in float32, one row of all images at a time.
     encoded["log"] = np.stack([np.median(held[:count, y].astype(np.float32), axis=0) for y in range(held.shape[1])])

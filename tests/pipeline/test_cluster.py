@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -16,9 +17,14 @@ from pathlib import Path
 import psutil
 import pytest
 
+from pipeline import cluster
 from pipeline.cluster import CLUSTERS
-from pipeline.errors import UserError
+from pipeline.config import Limits
+from pipeline.errors import MachineError, UserError
+from pipeline.executor import PoolBroken
+from pipeline.files import read_sealed
 from pipeline.runner import run_pipeline
+from pipeline.worker import PartTask
 
 pytest.importorskip("distributed", reason="Dask is not installed: pip install 'lightmill[dask]'")
 ROOT = Path(__file__).resolve().parents[2]
@@ -108,6 +114,55 @@ def test_limits_and_crashes_cost_an_item_not_a_dask_worker(scheduler, tmp_path, 
     assert sorted((r["item"], r["reason"]) for r in artifacts["numbers"].rejects()) == [("n003", "crash"), ("n004", "time")]
     assert len(artifacts["numbers"].rows()) == 7
     assert "n003: worker died with exit code -11; rejected as crash" in capsys.readouterr().out
+
+
+def test_a_scheduler_that_dies_is_the_machine_s_fault_and_costs_no_finished_part(scheduler, tmp_path):
+    address, start = scheduler
+    start(1)
+    log = tmp_path / "computed"
+
+    def kill() -> None:
+        until = time.monotonic() + 60
+        while not list((tmp_path / "store").glob("numbers/*.partial/markers/*.json")) and time.monotonic() < until:
+            time.sleep(0.02)
+        for process in psutil.Process().children():
+            if "scheduler" in process.cmdline():
+                process.kill()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    try:
+        with pytest.raises(MachineError, match="scheduler is gone .* run again"):
+            run(tmp_path / "store", {"name": "dask", "address": address}, numbers={"n": 24, "pause_s": 0.3})
+    finally:
+        killer.join()
+    done = {item for path in tmp_path.glob("store/numbers/*.partial/markers/*.json") for item in read_sealed(path)["items"]}
+    assert 0 < len(done) < 24
+    assert run(tmp_path / "store", numbers={"n": 24, "log_to": str(log)})[0] == run(tmp_path / "local", numbers={"n": 24})[0]
+    assert not done & set(log.read_text().split())
+
+
+def test_a_worker_whose_processes_keep_dying_is_the_machine_s_fault(tmp_path, monkeypatch):
+    """On the worker: what it raises must travel, or the run would see Dask's complaint about that instead."""
+
+    def broken(*arguments) -> None:
+        raise PoolBroken([])
+
+    monkeypatch.setattr("pipeline.cluster._code", lambda system, stage: "code")
+    monkeypatch.setattr("pipeline.cluster._pool", lambda guard: None)
+    monkeypatch.setattr("pipeline.cluster.run_on", broken)
+    task = PartTask("tests.pipeline.toy", "numbers", "key", None, {}, {}, tmp_path, "part", "", (), ())
+    with pytest.raises(MachineError, match="worker processes keep dying") as caught:
+        cluster._make_part(task, Limits(), "code", "guard")
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert (type(again), str(again)) == (MachineError, str(caught.value))
+
+
+def test_a_part_that_stays_invisible_is_the_machine_s_fault(tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.cluster.VISIBLE_S", 0.1)
+    task = PartTask("tests.pipeline.toy", "numbers", "key", None, {}, {}, tmp_path, "part", "", (), ())
+    with pytest.raises(MachineError, match="one shared file system"):
+        cluster._wait_until_visible(task)
 
 
 def test_own_cluster(tmp_path):

@@ -9,14 +9,18 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from model.errors import InputError
+from pipeline.__main__ import main
 from pipeline.config import parse
-from pipeline.errors import UserError
+from pipeline.errors import MachineError, UserError
 from pipeline.hydra_config import CONF, compose
-from pipeline.stage import load_system
+from pipeline.keys import canonical
+from pipeline.stage import MapStage, load_system
+from stages import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 SYSTEM = load_system("renderformer")
-ENGINE_FIELDS = {"workers", "limits", "max_reject_share"}  # every stage has them; YAML names them where they differ
+ENGINE_FIELDS = {"workers", "limits", "max_reject_share"}  # every stage has them; config.yaml names them for map stages
 VARIANTS = [(stage, path.stem) for stage in SYSTEM.modules for path in sorted((CONF / stage).glob("*.yaml"))]
 NEEDED = {("collect", "folder"): ["collect.path=/tmp"], ("collect", "objaverse"): ["collect.ids=[a]"]}
 
@@ -40,6 +44,27 @@ def test_yaml_names_every_field_of_its_config(stage, variant):
     assert missing(config, root[stage], stage) == []
 
 
+@pytest.mark.parametrize(
+    ("stage", "variant"), [(stage, variant) for stage, variant in VARIANTS if isinstance(SYSTEM.stage(stage), MapStage)]
+)
+def test_what_remedies_machine_rejects_can_be_set_for_every_map_stage_and_enters_no_key(stage, variant):
+    """As docs/faults.md gives it, without a ``+``."""
+    plain = [f"{stage}={variant}", *NEEDED.get((stage, variant), [])]
+    root = compose([*plain, f"{stage}.limits.wall_s=5", f"{stage}.limits.memory_gb=4", f"{stage}.max_reject_share=0.9"])
+    before, after = (
+        parse(load_system(root["system"]).stage(stage).Config, data[stage], stage) for data in (compose(plain), root)
+    )
+    assert (after.limits.wall_s, after.limits.memory_gb, after.max_reject_share) == (5, 4, 0.9)
+    assert after.limits.cpu_s == before.limits.cpu_s  # what a variant gives stays
+    assert canonical(after) == canonical(before)
+
+
+def test_limits_of_the_paper_s_scenes():
+    for overrides in (["render=paper"], ["experiment=paper_256", "collect.ids=[a]"]):
+        config = parse(SYSTEM.stage("render").Config, compose(overrides)["render"], "render")
+        assert config.limits.model_dump(exclude_none=True) == {"cpu_s": 7200, "wall_s": 14400}
+
+
 @pytest.mark.parametrize("model", sorted(path.stem for path in (CONF / "model").glob("*.yaml")))
 def test_every_model_is_a_valid_config(model):
     parse(SYSTEM.stage("train").Config, compose([f"model={model}", "train.informed_start=inputs"])["train"], "train")
@@ -54,6 +79,7 @@ def test_every_model_is_a_valid_config(model):
         (["stge=train"], "did you mean 'stage'"),
         (["collect=folder", "collect.pth=x"], "did you mean 'collect.path'"),
         (["nonsense"], "name=value"),
+        (["render.limits.walls=4"], "did you mean 'render.limits.wall_s'"),
     ],
 )
 def test_wrong_words_name_the_right_ones(overrides, message):
@@ -83,6 +109,28 @@ def test_command_line_accepts_the_sweep_flag_anywhere(tmp_path, flags):
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("06 train") == (2 if flags else 1)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [(UserError("mend it"), 2), (InputError("mend it"), 2), (MachineError("mend it"), 6), (ValueError(), 1)],
+)
+def test_only_errors_for_people_are_one_line(tmp_path, monkeypatch, capsys, error, status):
+    """Those of model/, which does not know the engine, too; any other ValueError is a bug and shows where it is."""
+
+    def fail(*arguments) -> None:
+        raise error
+
+    monkeypatch.setattr("pipeline.__main__.run_pipeline", fail)
+    monkeypatch.setattr(sys, "argv", ["lightmill"])
+    words = ["stage=collect", f"store={tmp_path}", f"hydra.run.dir={tmp_path}/r"]
+    for start in (main, lambda words: cli.main(["run", *words])):
+        if status == 1:
+            with pytest.raises(ValueError):
+                start(words)
+        else:
+            assert start(words) == status
+            assert capsys.readouterr().err.splitlines()[-1] == "error: mend it"
 
 
 def test_error_is_one_line_with_a_status(tmp_path):

@@ -127,7 +127,69 @@ def test_an_item_that_sleeps_for_ever_is_rejected_alone(tmp_path):
     assert status == 0
     assert output.count("n003: over 0.5 s on the clock") == 2
     (reject,) = Store(tmp_path).resolve("numbers").rejects()
-    assert (reject["item"], reject["reason"], reject["machine"]) == ("n003", "time", True)
+    assert (reject["item"], reject["reason"], reject["machine"], reject["limit"]) == ("n003", "time", True, {"wall_s": 0.5})
+
+
+def test_a_raised_limit_tries_again_what_the_lower_one_rejected_and_nothing_else(tmp_path):
+    """In an unfinished artifact. The crash beside it stays: no limit was in its way."""
+    log = tmp_path / "computed"
+
+    def run(**numbers) -> tuple[int, str, list[str]]:
+        log.write_text("")
+        status, output = finish(start(command(tmp_path, "numbers", numbers={"n": 6, "log_to": str(log), **numbers})))
+        return status, output, sorted(log.read_text().split())
+
+    status, output, _ = run(sleep=["n003"], crash=["n005"], limits={"wall_s": 0.5}, max_reject_share=0)
+    assert status == TooManyRejects.status and "1 crash, 1 time" in output
+    for limits in ({"wall_s": 0.5}, {"wall_s": 0.4, "cpu_s": 9999, "memory_gb": 99}):  # as before; none that it ran into
+        assert run(limits=limits, max_reject_share=0)[::2] == (TooManyRejects.status, [])
+    status, output, computed = run(limits={"wall_s": 100}, sleep=["n001"])  # n001 lies in the same part and is kept
+    assert (status, computed) == (0, ["n003"]), output
+    assert "1 item(s) that lower limits rejected before are tried again" in output and "5 of them already there" in output
+    artifact = Store(tmp_path).resolve("numbers")
+    assert artifact.ids() == ["n000", "n002", "n004", "n001", "n003"] and artifact.verify(deep=True) == []
+    assert [(reject["item"], reject["reason"]) for reject in artifact.rejects()] == [("n005", "crash")]
+
+
+def test_what_the_machine_rejected_is_told_and_can_be_tried_again(tmp_path, undisturbed):
+    """In a committed artifact: the rest of it is taken over, whole parts by hard link."""
+    log = tmp_path / "computed"
+
+    def run(*retry: str, **numbers) -> tuple[int, str, list[str]]:
+        log.write_text("")
+        words = command(tmp_path, "numbers", retry=retry, numbers={"n": 12, "log_to": str(log), **numbers})
+        status, output = finish(start(words))
+        return status, output, sorted(log.read_text().split())
+
+    assert run(crash=["n002"], sleep=["n003"], limits={"wall_s": 0.5})[0] == 0
+    inodes = {path.stat().st_ino for path in tmp_path.glob("numbers/*/parts/*.tar")}
+    status, output, computed = run()
+    assert (status, computed) == (0, [])
+    assert "up to date" in output and "note: the machine rejected 2 of its items (1 crash, 1 time)" in output
+    assert " retry=numbers, numbers.limits.wall_s=N allows more than 0.5" in output
+    status, output, computed = run("numbers", sleep=["n003"], limits={"wall_s": 0.5})  # n002 goes well now
+    assert (status, set(computed)) == (0, {"n002", "n003"}) and "DIFFERENT from before" in output
+    assert len(inodes & {path.stat().st_ino for path in tmp_path.glob("numbers/v1-*/parts/*.tar")}) == 2  # of four
+    status, output, computed = run("numbers")
+    assert (status, computed) == (0, ["n003"])
+    assert digests(tmp_path)["numbers"] == undisturbed(12)["numbers"]
+    status, output, computed = run("numbers")
+    assert (status, computed) == (0, []) and "up to date" in output and "note" not in output
+
+
+def test_a_kill_between_the_tries_under_two_limits_costs_nothing_that_was_finished(tmp_path, undisturbed):
+    log = tmp_path / "computed"
+    numbers = {"n": 6, "log_to": str(log), "max_reject_share": 0}
+    words = command(tmp_path, "numbers", workers=1, numbers=numbers | {"sleep": ["n003"], "limits": {"wall_s": 0.5}})
+    assert finish(start(words))[0] == TooManyRejects.status
+    process = start(command(tmp_path, "numbers", workers=1, numbers=numbers | {"sleep": ["n003"]}))
+    wait_for(at_work(tmp_path, "n003"), process)
+    process.kill()
+    process.wait()
+    log.write_text("")
+    assert finish(start(command(tmp_path, numbers=numbers)))[0] == 0
+    assert log.read_text().split() == ["n003"]
+    assert digests(tmp_path) == undisturbed(6)
 
 
 @pytest.mark.parametrize("times", [1, 2])
@@ -313,4 +375,9 @@ def test_each_kind_of_trouble_has_its_exit_status(tmp_path):
     assert code == ItemsFailed.status and "RuntimeError: a bug" in output
     log = Path(output.partition("Its traceback: ")[2].partition(" (")[0])
     assert "n003: " in log.read_text() and "RuntimeError: a bug" in log.read_text()
+    code, output = status(numbers={"n": 7}, squares={"bug": "value"})  # a ValueError is no user's fault by itself
+    assert code == 1 and "Traceback" in output and "in stage squares" in output
+    code, output = status(numbers={"n": 7}, squares={"bug": "file"})
+    assert code == MachineError.status and "Traceback" not in output
+    assert "cannot be read or written: No such file or directory" in output and "nowhere" in output
     assert status(numbers={"n": 7})[0] == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -10,8 +9,23 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.errors import UserError
+from pipeline.hydra_config import compose
 from pipeline.store import Store
-from pipeline.sweep import JOB_VARIABLE, KEYS_VARIABLE, describe, expand, label, shared_stages, sweep_keys
+from pipeline.sweep import (
+    JOB_VARIABLE,
+    KEYS_VARIABLE,
+    check_keys,
+    describe,
+    expand,
+    keys_of,
+    label,
+    plan_of,
+    planned_keys,
+    run_side_by_side,
+    shared_stages,
+    sweep_keys,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -85,13 +99,41 @@ def test_a_failed_job_leaves_the_others_and_is_taken_up_again(tmp_path, folders)
 
 
 def test_a_job_whose_config_is_not_the_planned_one_stops(tmp_path):
-    keys = json.dumps({f"stage=collect collect.per_family=1 store={tmp_path}/store": {"collect": "0" * 64}})
+    keys = planned_keys({f"stage=collect collect.per_family=1 store={tmp_path}/store": {"collect": "0" * 64}})
     done = run(tmp_path, "stage=collect", "collect.per_family=1", **{KEYS_VARIABLE: keys, JOB_VARIABLE: "1"})
     assert done.returncode == 2 and "changed after the sweep began" in done.stderr
     assert not Store(tmp_path / "store").artifacts()
 
 
-def test_what_all_jobs_share_is_not_forced_by_each_of_them(tmp_path):
-    words = ["stage=remesh", "remesh.resolution=48,49", "collect.per_family=1", "force=collect", "jobs=2", "-m"]
+def test_a_sweep_of_thousands_of_jobs_starts_processes_and_knows_all_their_keys(tmp_path, monkeypatch):
+    """All keys go into one variable of the environment, and Linux refuses those of 128 KiB."""
+    jobs = {
+        f"stage=collect collect.per_family={number} store={tmp_path}": {"collect": f"{number:064}"} for number in range(8000)
+    }
+    monkeypatch.setenv(KEYS_VARIABLE, planned_keys(jobs))
+    subprocess.run(["true"], check=True)
+    root = compose(["stage=collect", "collect.per_family=1", f"store={tmp_path}"])
+    for task in list(jobs)[::1000]:
+        with pytest.raises(UserError, match="changed after the sweep began"):
+            check_keys(task, root)
+    check_keys("stage=collect collect.per_family=9000", root)  # no job of the sweep
+    task = list(jobs)[1]
+    monkeypatch.setenv(KEYS_VARIABLE, planned_keys(jobs | {task: keys_of(plan_of(root))}))
+    check_keys(task, root)
+    with pytest.raises(UserError, match="8001 jobs: at most 8000"):
+        planned_keys(jobs | {"more": {}})
+
+
+def test_a_job_that_a_signal_killed_has_the_status_that_a_shell_gives_it(tmp_path, monkeypatch):
+    killed = [sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"]
+    popen = subprocess.Popen
+    monkeypatch.setattr("pipeline.sweep.subprocess.Popen", lambda words, **options: popen(killed, **options))
+    jobs = expand(["stage=collect", "collect.per_family=1,2", f"store={tmp_path}"])
+    assert run_side_by_side(jobs, 2, [], ["test"], print) == {"1": 137, "2": 137}
+
+
+@pytest.mark.parametrize("setting", ["force", "retry"])
+def test_what_all_jobs_share_is_not_forced_by_each_of_them(tmp_path, setting):
+    words = ["stage=remesh", "remesh.resolution=48,49", "collect.per_family=1", f"{setting}=collect", "jobs=2", "-m"]
     done = run(tmp_path, *words)
-    assert done.returncode == 2 and "force=collect: all jobs of the sweep share it" in done.stderr
+    assert done.returncode == 2 and f"{setting}=collect: all jobs of the sweep share it" in done.stderr

@@ -79,6 +79,7 @@ class SquaresConfig(StageConfig):
     log_to: str | None = runtime(None)  # a file that gets a line per computed item
     finish_s: float = runtime(0.0)
     unsteady: bool = runtime(False)  # other output each time
+    bug: str = runtime("")  # in finish: "value", or "file" for one that is not there
 
 
 class Squares(MapStage):
@@ -106,6 +107,10 @@ class Squares(MapStage):
         yield Record(item.id, {"square.txt": str(value**2 + config.offset + unsteady).encode()})
 
     def finish(self, config, inputs, draft):
+        if config.bug == "value":
+            int("no number")
+        if config.bug == "file":
+            (inputs["numbers"].path / "files" / "nowhere").read_bytes()
         (draft.files / "card.txt").write_text(f"{len(draft.rows())} squares\n")
         time.sleep(config.finish_s)
         draft.note("count", len(draft.rows()))
