@@ -155,7 +155,7 @@ def compare_scene(
     (traced,) = render_views(scene, len(predicted), max_spp=spp, seed=0, backend=backend, views=[view])
     names = (
         f"{path}, view {view}, path traced, {traced.meta['spp']} samples per pixel, denoised",
-        str(renderer.folder),
+        "the model that ships" if checkpoint is None else str(renderer.folder),
     )
     notes = [*scene.meta.get("notes", ()), *(str(warning.message) for warning in caught)]
     try:
