@@ -490,6 +490,9 @@ def _run_map(
                     part_key, group, part_items, part_item_keys, reuse, limits=limits,
                 )
             )  # fmt: skip
+    part_keys = list(parts)
+    # There may be millions, and workers and what follows need the room; what is to be made is in the tasks.
+    del items, keys, donors, parts, markers
     reused = total - sum(fresh.values())
     if not forced:
         sources: dict[Path, _Source] = {}
@@ -502,7 +505,7 @@ def _run_map(
     out(f"{label} running    {total} items" + (f", {reused} of them already there" if reused else ""))
     progress = Progress(f"{label}", total, reused)
     failed: list[tuple[str, str, Path]] = []
-    state.update(now=True, parts=len(parts), total=total, reused=reused, done=reused)
+    state.update(now=True, parts=len(part_keys), total=total, reused=reused, done=reused)
 
     def on_result(result: PartResult) -> None:
         log = log_file(draft.path, result.part_key)
@@ -535,8 +538,6 @@ def _run_map(
             f"{planned.name}: {len(failed)} item(s) failed: {names}. The first: {last}. Its traceback: {log} "
             "(`lightmill status` names the others'). Everything else is kept; run again to continue"
         )
-    part_keys = list(parts)
-    del items, keys, parts, markers  # there may be millions, and what follows needs the room
     draft.use_parts(_finished(planned.name, draft, part_keys))
     _check_rejects(planned, stage, draft, total)
     for path in sorted(draft.files.rglob("*"), reverse=True):  # what an interrupted finish left
