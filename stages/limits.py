@@ -12,6 +12,7 @@ import numpy as np
 
 from stages.records import SceneRecord
 from stages.scenes.laws import CameraLaw, LightLaw, MaterialLaw
+from stages.scenes.meshes import areas
 from stages.scenes.room import LARGEST_TRIANGLE
 
 RELEASED_TRIANGLES = 4096  # of the released training data, for checkpoints that do not say (section 2)
@@ -49,16 +50,12 @@ def beyond_limits(
     ]
 
 
-def _areas(triangles: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1) / 2
-
-
 def light_radiance(scene: SceneRecord) -> np.ndarray:
     """(L,) radiance of each light, the mean over its area and the colour channels."""
     emits = scene.light_index >= 0
-    areas, light = _areas(scene.triangles[emits].astype(np.float64)), scene.light_index[emits]
-    power = np.bincount(light, areas * scene.emission[emits].mean(axis=1, dtype=np.float64), minlength=scene.n_lights)
-    return power / np.maximum(np.bincount(light, areas, minlength=scene.n_lights), 1e-12)
+    size, light = areas(scene.triangles[emits]), scene.light_index[emits]
+    power = np.bincount(light, size * scene.emission[emits].mean(axis=1, dtype=np.float64), minlength=scene.n_lights)
+    return power / np.maximum(np.bincount(light, size, minlength=scene.n_lights), 1e-12)
 
 
 def _outside(values: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -89,7 +86,7 @@ def _size(scene: SceneRecord, resolution: tuple[int, int], trained_with: Mapping
             f"the scene reaches {reach:,.2f} from the origin: the training data lies within {REACH:g}, one unit being the "
             "whole scene (scale it, cameras and lights included)"
         )
-    largest = float(np.linalg.norm(np.cross(solid[:, 1] - solid[:, 0], solid[:, 2] - solid[:, 0]), axis=1).max() / 2)
+    largest = float(areas(solid).max())
     if largest > 2 * LARGEST_TRIANGLE:
         yield f"a triangle of area {largest:.3f}: the training data's largest have about {LARGEST_TRIANGLE:.3f} (subdivide it)"
 
@@ -103,13 +100,13 @@ def _lights(scene: SceneRecord, one_by_one: bool) -> Iterator[str]:
         return
     emission, light = scene.emission[emits].astype(np.float64), scene.light_index[emits]
     triangles = scene.triangles[emits].astype(np.float64)
-    areas = _areas(triangles)
-    area = np.bincount(light, areas, minlength=count)
+    size = areas(triangles)
+    area = np.bincount(light, size, minlength=count)
     low, high = law.radiance  # also of a light alone in its pass, which is made as bright as all together
     yield from _worst(np.array([light_radiance(scene).sum()]), low, high, "lights of a total radiance of", digits=0)
     small = 0.0022 * law.scale[0] ** 2  # of the light triangle, before it is scaled
     yield from _worst(area, small / 2, 2 * 0.0022 * law.scale[1] ** 2, "a light of area", digits=4)
-    centres = np.stack([np.bincount(light, areas * triangles.mean(axis=1)[:, i], minlength=count) for i in range(3)], axis=1)
+    centres = np.stack([np.bincount(light, size * triangles.mean(axis=1)[:, i], minlength=count) for i in range(3)], axis=1)
     distance = np.linalg.norm(centres / np.maximum(area, 1e-12)[:, None], axis=1)
     slack = float(np.sqrt(3) * law.target[1])  # the target is not the origin
     yield from _worst(distance, law.distance[0] - slack, law.distance[1] + slack, "a light", " from the origin")

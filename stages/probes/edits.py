@@ -16,16 +16,11 @@ from stages.records import SceneRecord, patch_means
 from stages.scenes import meshes
 from stages.scenes.assemble import place, rotation_matrix
 from stages.scenes.laws import TEMPLATES, Light, LightLaw, Material, Placement, draw_lights
+from stages.scenes.meshes import areas
 
 FACE_ARRAYS = tuple(name for name in SceneRecord.DTYPES if name not in ("camera_to_world", "fov_deg"))
 MOST_LIGHTS = 16  # that fit on the smallest shell, LIGHT_SEPARATION apart
 LIGHT_SEPARATION = 0.2
-
-
-def areas(triangles: np.ndarray) -> np.ndarray:
-    """(F,) areas of (F, 3, 3) triangles."""
-    edges = triangles[:, 1:].astype(np.float64) - triangles[:, :1]
-    return 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
 
 
 def power(scene: SceneRecord) -> np.ndarray:

@@ -18,6 +18,12 @@ def _grid(rows: int, columns: int) -> np.ndarray:
     return np.concatenate([np.hstack([a, b, c]), np.hstack([a, c, d])], axis=1).reshape(-1, 3)
 
 
+def areas(triangles: np.ndarray) -> np.ndarray:
+    """(F,) areas of (F, 3, 3) triangles."""
+    edges = triangles[:, 1:].astype(np.float64) - triangles[:, :1]
+    return 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+
+
 @cache
 def wall(name: str) -> Mesh:
     """Wall of 8 x 8 quads (128 triangles) over [-1, 1]^2, at distance 1 from the origin, facing it."""

@@ -102,8 +102,7 @@ def room_scene(path: Path, triangles: int | None = None, room: Room | None = Non
 
 def _largest(mesh: meshes.Mesh, placement: Placement) -> float:
     """Area of the largest triangle of the placed object."""
-    corners = place(normalize(mesh[0]), placement)[mesh[1]]
-    return float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).max() / 2)
+    return float(meshes.areas(place(normalize(mesh[0]), placement)[mesh[1]]).max())
 
 
 def _template(triangles: int | None, faces: int) -> str:
