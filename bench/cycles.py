@@ -4,8 +4,8 @@
 
 Imports nothing of lightmill. Reads ``triangles`` (F, 3, 3), ``vertex_normals`` (F, 3, 3), ``diffuse``, ``specular``,
 ``emission`` (F, 3), ``roughness``, ``light_index`` (F,), ``camera_to_world`` (V, 4, 4) and ``fov_deg`` (V,), with the meaning
-of ``stages.records.SceneRecord``; writes ``FOLDER/<name>-<view>.exr`` (float32, linear) and prints one line of JSON: seconds
-of export per scene and of each render.
+of ``stages.renderformer.records.SceneRecord``; writes ``FOLDER/<name>-<view>.exr`` (float32, linear) and prints one line of
+JSON: seconds of export per scene and of each render.
 
 One design choice: all surface triangles are one mesh whose material reads face attributes, so that thousands of materials
 cost nothing; lights are a second mesh (camera rays may pass through it) with a constant material per distinct radiance,

@@ -20,12 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.store import Artifact, Store, iter_inputs
-from stages.dataset import BatchConfig, Batches, Relight, ShardDataset, prefetch
-from stages.dataset.encoding import decode_scene
-from stages.dataset.shards import Reader
-from stages.exr import LAYERS, _decode, decode_layers, decode_lights, view_members
-from stages.interchange import write_hdf5
-from stages.records import SceneRecord
+from stages.graphics.exr import _decode, decode_lights
+from stages.renderformer.dataset import BatchConfig, Batches, Relight, ShardDataset, prefetch
+from stages.renderformer.dataset.encoding import decode_scene
+from stages.renderformer.dataset.interchange import write_hdf5
+from stages.renderformer.dataset.shards import Reader
+from stages.renderformer.records import SceneRecord
+from stages.renderformer.views import LAYERS, decode_layers, view_members
 
 BLOCK = 512  # of a tar
 
@@ -249,8 +250,8 @@ def precision(scenes: list[SceneRecord], checkpoints: list[Path]) -> None:
 
     import torch
 
-    from stages.predict import load_model, predict_scene
-    from stages.tonemap import log_encode
+    from stages.graphics.tonemap import log_encode
+    from stages.renderformer.inference.predict import load_model, predict_scene
 
     def pixels(scene: SceneRecord, triangles: np.ndarray) -> np.ndarray:
         points = triangles[scene.light_index < 0].reshape(-1, 3).astype(np.float64)

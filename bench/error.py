@@ -6,8 +6,9 @@ Renders views at 16, 64 and 256 samples per pixel as the render stage stores the
 truths and their cache are those of ``bench/render.py``. Prints by samples per pixel the mean error (absolute difference of
 log10(1 + x)) of the raw image, of the sum of the lights denoised as one, and of the stored image, whose lights are denoised
 one by one; how far denoising moves the mean of values clamped at 4; and how the estimated error of the stored image relates
-to the true one. With ``-o`` the estimates are drawn against the true errors. The weights in ``stages/rendering/error.py`` come
-from such runs. Some 20 minutes on 2 quiet cores, nearly all of it for the truths.
+to the true one. With ``-o`` the estimates are drawn against the true errors. The weights in
+``stages/renderformer/rendering/error.py`` come from such runs. Some 20 minutes on 2 quiet cores, nearly all of it for the
+truths.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from render import ROOT, Bench, View, choose_views, made_scenes, read_scenes
 
-from stages.rendering import backend as backends
-from stages.rendering.denoising import denoise
+from stages.graphics.denoising import denoise
+from stages.renderformer.rendering import backend as backends
 
 SAMPLES = (16, 64, 256)
 FACTOR = 1.5  # within which an estimate counts as right

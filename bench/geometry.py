@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from stages.geometry import one_thread
+from stages.graphics.geometry import one_thread
 
 one_thread()
 
@@ -26,12 +26,12 @@ import numpy as np  # noqa: E402
 from pipeline.config import parse  # noqa: E402
 from pipeline.errors import Reject  # noqa: E402
 from pipeline.stage import Item, Record  # noqa: E402
-from stages.geometry import decimator, load, measure, remesher  # noqa: E402
-from stages.geometry.catalogue import record_id  # noqa: E402
-from stages.geometry.procedural import FAMILIES  # noqa: E402
-from stages.records import MeshRecord  # noqa: E402
-from stages.s01_remesh import Remesh  # noqa: E402
-from stages.s02_decimate import Decimate  # noqa: E402
+from stages.graphics.geometry import decimator, load, measure, remesher  # noqa: E402
+from stages.graphics.geometry.records import MeshRecord  # noqa: E402
+from stages.renderformer.objects.catalogue import record_id  # noqa: E402
+from stages.renderformer.objects.procedural import FAMILIES  # noqa: E402
+from stages.renderformer.s01_remesh import Remesh  # noqa: E402
+from stages.renderformer.s02_decimate import Decimate  # noqa: E402
 
 PHASES = {  # what is timed: (where it is called, its name, in words)
     "distances in the band": (remesher, "narrow_band"),

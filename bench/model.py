@@ -6,9 +6,9 @@
     python bench/model.py --attention     # ways to attend within scenes of different size
 
 Random triangles and weights; every row in a fresh process, best of several repeats. "of mm": floating-point operations of
-matrix products, convolutions and attention (``model.flops``) per second, over those of a large ``torch.mm`` of the same
-precision that is timed between the repeats. A training step counts as three forward passes. Parts are timed in one more repeat
-with a clock at each.
+matrix products, convolutions and attention (``model.renderformer.flops``) per second, over those of a large ``torch.mm`` of
+the same precision that is timed between the repeats. A training step counts as three forward passes. Parts are timed in one
+more repeat with a clock at each.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from model import layers, reference  # noqa: E402
-from model.config import ModelConfig  # noqa: E402
-from model.flops import TRAINING, forward_flops, ideal_seconds  # noqa: E402
-from model.inputs import constant_material, material_patches  # noqa: E402
-from model.losses import image_loss  # noqa: E402
-from model.renderformer import RenderFormer  # noqa: E402
+from model.renderformer import layers, reference  # noqa: E402
+from model.renderformer.config import ModelConfig  # noqa: E402
+from model.renderformer.flops import TRAINING, forward_flops, ideal_seconds  # noqa: E402
+from model.renderformer.inputs import constant_material, material_patches  # noqa: E402
+from model.renderformer.losses import image_loss  # noqa: E402
+from model.renderformer.network import RenderFormer  # noqa: E402
 from pipeline.hydra_config import compose  # noqa: E402
-from stages.s06_train import ModelSection  # noqa: E402
+from stages.renderformer.s06_train import ModelSection  # noqa: E402
 from tests.model.synthetic import batch  # noqa: E402
 
 TOLERANCE = 2e-5  # of the fast path against the plain one, in log10(1 + radiance)
@@ -181,7 +181,11 @@ def one(setup: dict[str, Any]) -> dict[str, Any]:
         shares = {name: seconds / total for name, seconds in parts.seconds.items()}
         shares["rest"] = 1 - sum(shares.values())
     counts = forward_flops(
-        model.config, [setup["triangles"]] * setup["scenes"], setup["views"], setup["resolution"], setup["resolution"]
+        model.config,
+        [setup["triangles"]] * setup["scenes"],
+        setup["views"],
+        setup["resolution"],
+        setup["resolution"],
     )
     passes = TRAINING if setup["train"] else 1
     row = {

@@ -55,14 +55,15 @@ import numpy as np
 
 from pipeline.keys import seed_for
 from pipeline.store import Artifact
-from stages.exr import encode_view, read_rgb, view_members
-from stages.metrics import log_error
-from stages.records import SceneRecord
-from stages.released import load_scene
-from stages.rendering import backend as backends
-from stages.rendering import denoising
-from stages.rendering.render import render_views
-from stages.s04_render import Render
+from stages.graphics import denoising
+from stages.graphics.exr import read_rgb
+from stages.graphics.metrics import log_error
+from stages.renderformer.records import SceneRecord
+from stages.renderformer.rendering import backend as backends
+from stages.renderformer.rendering.render import render_views
+from stages.renderformer.s04_render import Render
+from stages.renderformer.scenes.released import load_scene
+from stages.renderformer.views import encode_view, view_members
 
 ROOT = Path(__file__).resolve().parents[1]
 MAX_DEPTH = 34  # segments; Cycles: 32 bounces
@@ -344,8 +345,8 @@ class BuiltIn:
     def __init__(self, scene: SceneRecord, resolution: int):
         import mitsuba as mi
 
-        from stages.rendering.scalar import perspective
-        from stages.rendering.surfaces import face_normals, mesh_of, surface_mesh
+        from stages.renderformer.rendering.scalar import perspective
+        from stages.renderformer.rendering.surfaces import face_normals, mesh_of, surface_mesh
 
         surfaces, lights = np.nonzero(scene.light_index < 0)[0], scene.light_index >= 0
         shapes = {"surface": surface_mesh(scene, surfaces)}

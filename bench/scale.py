@@ -370,8 +370,8 @@ def make_sample(work: Path, scenes: int) -> Store:
 
 def training_days(gpus: int) -> float:
     """Days of ``paper_256`` on A100s at the utilisation that ``plan=true`` assumes."""
-    from model.flops import TRAINING, forward_flops, ideal_seconds
-    from stages.s06_train import A100_TFLOPS, UTILISATION
+    from model.renderformer.flops import TRAINING, forward_flops, ideal_seconds
+    from stages.renderformer.s06_train import A100_TFLOPS, UTILISATION
 
     root = compose(["stage=train", "experiment=paper_256", "collect.ids_file=FILE"])
     config = parse(load_system("renderformer").stage("train").Config, root["train"], "train")

@@ -22,12 +22,12 @@ import torch  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from model.losses import image_loss  # noqa: E402
-from model.optimization import optimizers  # noqa: E402
-from model.renderformer import RenderFormer  # noqa: E402
-from model.training import predict  # noqa: E402
+from model.renderformer.losses import image_loss  # noqa: E402
+from model.renderformer.network import RenderFormer  # noqa: E402
+from model.renderformer.training import predict  # noqa: E402
+from model.training.optimization import optimizers  # noqa: E402
 from pipeline.config import StageConfig  # noqa: E402
-from stages.ablation import jobs_of  # noqa: E402
+from stages.renderformer.evaluation.ablation import jobs_of  # noqa: E402
 from tests.model.synthetic import batch  # noqa: E402
 
 

@@ -17,9 +17,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from pipeline.errors import UserError
 from pipeline.store import Store
-from stages.geometry import one_thread
-from stages.geometry.rungs import load_rungs
-from stages.records import MeshRecord, TextureRecord
+from stages.graphics.geometry import one_thread
+from stages.graphics.geometry.records import MeshRecord, TextureRecord
+from stages.renderformer.objects.rungs import load_rungs
 
 
 def timed(function, *arguments):
@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("--objects", type=int, default=8)
     arguments = parser.parse_args()
     one_thread()
-    from stages.scenes import textures
+    from stages.renderformer.scenes import textures
 
     store = Store(arguments.store)
     decimate = store.resolve("decimate")

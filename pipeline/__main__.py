@@ -19,7 +19,8 @@ from omegaconf import DictConfig
 
 from pipeline.errors import INTERRUPTED, for_people, status_of
 from pipeline.hydra_config import CONF, compose, to_plain
-from pipeline.runner import run_pipeline, split_config
+from pipeline.plan import split_config
+from pipeline.run import run_pipeline
 from pipeline.sweep import (
     KEYS_VARIABLE,
     check_keys,

@@ -14,9 +14,9 @@ from typing import Any
 
 from pipeline.errors import Damaged, UserError
 from pipeline.hydra_config import compose
+from pipeline.plan import make_plan, split_config
 from pipeline.progress import duration
 from pipeline.repair import repair
-from pipeline.runner import make_plan, split_config
 from pipeline.status import lines, read_states
 from pipeline.store import Artifact, HashCache, Store, iter_inputs
 

@@ -20,7 +20,8 @@ from typing import Any
 from pipeline.config import parse
 from pipeline.errors import Damaged, UserError
 from pipeline.keys import digest_of
-from pipeline.runner import Planned, RunConfig, make_artifact, plan_stage
+from pipeline.make import make_artifact
+from pipeline.plan import Planned, RunConfig, plan_stage
 from pipeline.stage import MapStage, load_system
 from pipeline.store import UNKNOWN, Artifact, Draft, HashCache, Row, Store, is_sound, read_draft, record_digest
 from pipeline.worker import log_file

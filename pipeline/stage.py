@@ -17,9 +17,7 @@ from pipeline.errors import Reject, UserError
 
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Draft
-
-RECORD_ID = re.compile(r"[A-Za-z0-9_-]{1,120}\Z")
-MEMBER_NAME = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
+from pipeline.store.record import Record
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,21 +32,6 @@ class Item:
     id: str
     group: str = ""
     needs: tuple[tuple[str, str], ...] | None = None
-
-
-@dataclass(frozen=True)
-class Record:
-    """Named bytes: one sample of an artifact, stored as tar members ``<id>.<member>`` (the webdataset convention)."""
-
-    id: str
-    members: Mapping[str, bytes]
-
-    def __post_init__(self) -> None:
-        if not RECORD_ID.match(self.id):
-            raise ValueError(f"record id {self.id!r} may hold only letters, digits, '_' and '-', at most 120")
-        for name in self.members:
-            if not MEMBER_NAME.match(name):
-                raise ValueError(f"member name {name!r} of record {self.id} must be lower case words joined by dots")
 
 
 Inputs = Mapping[str, "Artifact"]

@@ -26,7 +26,8 @@ from hydra.errors import HydraException
 from pipeline.errors import UserError
 from pipeline.executor import THREAD_VARIABLES
 from pipeline.hydra_config import compose
-from pipeline.runner import Planned, make_plan, run_pipeline, split_config
+from pipeline.plan import Planned, make_plan, split_config
+from pipeline.run import run_pipeline
 from pipeline.store import HashCache, Store
 from pipeline.worker import die_with_parent
 

@@ -26,9 +26,9 @@ from typing import Any
 
 from pipeline.config import Limits
 from pipeline.errors import STORAGE_ERRORS, Damaged, Reject, UserError
-from pipeline.listing import Row
 from pipeline.stage import Item, MapStage, Record, load_system
 from pipeline.store import Artifact, Draft
+from pipeline.store.listing import Row
 
 THREADS_VARIABLE = "LIGHTMILL_THREADS"  # what a stage may use in a worker; also set as OMP_NUM_THREADS and its like
 _opened: dict[tuple[str, str], tuple[MapStage, Any]] = {}  # (stage, key) -> the stage and its worker, once per process

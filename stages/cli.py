@@ -26,7 +26,7 @@ def command_run(arguments: argparse.Namespace) -> int:
 
 
 def command_trace(arguments: argparse.Namespace) -> int:
-    from stages.trace import trace
+    from stages.renderformer.inference.trace import trace
 
     for path in trace(
         Path(arguments.scene),
@@ -46,13 +46,13 @@ def command_trace(arguments: argparse.Namespace) -> int:
 
 
 def room(arguments: argparse.Namespace) -> Any:
-    from stages.scenes.room import Room
+    from stages.renderformer.inference.room import Room
 
     return Room(arguments.room, arguments.up)
 
 
 def command_predict(arguments: argparse.Namespace) -> int:
-    from stages.inference import predict
+    from stages.renderformer.inference.renderer import predict
 
     for path in predict(
         arguments.scene,
@@ -76,9 +76,9 @@ def command_predict(arguments: argparse.Namespace) -> int:
 
 
 def command_compare(arguments: argparse.Namespace) -> int:
-    from stages.compare import IMAGES, check_picture, compare_images, compare_scene
-    from stages.inference import write_png
-    from stages.metrics import with_lpips
+    from stages.graphics.metrics import with_lpips
+    from stages.renderformer.inference.compare import IMAGES, check_picture, compare_images, compare_scene
+    from stages.renderformer.inference.renderer import write_png
 
     first, out = Path(arguments.a), arguments.out
     metrics = with_lpips(arguments.lpips, arguments.lpips_folder)
@@ -115,7 +115,7 @@ def command_compare(arguments: argparse.Namespace) -> int:
 
 def dataset_source(reference: str, store: str) -> Any:
     """A dataset's folder or URL as given, or a shard artifact in the store."""
-    from stages.dataset.shards import INDEX, REMOTE
+    from stages.renderformer.dataset.shards import INDEX, REMOTE
 
     if REMOTE.match(reference) or (Path(reference) / "files" / INDEX).is_file():
         return reference
@@ -128,7 +128,7 @@ def dataset_source(reference: str, store: str) -> Any:
 
 
 def command_export(arguments: argparse.Namespace) -> int:
-    from stages.interchange import export
+    from stages.renderformer.dataset.interchange import export
 
     source, out = dataset_source(arguments.dataset, arguments.store), Path(arguments.out)
     count = sum(1 for _ in export(source, out, arguments.split, arguments.images))
@@ -137,13 +137,13 @@ def command_export(arguments: argparse.Namespace) -> int:
 
 
 def command_sweep(arguments: argparse.Namespace) -> int:
-    from stages.ablation import sweep
+    from stages.renderformer.evaluation.ablation import sweep
 
     return sweep(arguments.table, arguments.rows, arguments.words, Path(arguments.out or f"runs/{arguments.table}"))
 
 
 def command_table(arguments: argparse.Namespace) -> int:
-    from stages.ablation import write_table
+    from stages.renderformer.evaluation.ablation import write_table
 
     return write_table(arguments.table, arguments.rows, arguments.words, Path(arguments.out or f"runs/{arguments.table}"))
 
@@ -157,7 +157,7 @@ def command_import(arguments: argparse.Namespace) -> int:
 
 def command_report(arguments: argparse.Namespace) -> int:
     from pipeline.store import Store
-    from stages.report import write_report
+    from stages.renderformer.evaluation.side_by_side import write_report
 
     for path in write_report(
         arguments.keys,

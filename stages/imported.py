@@ -9,8 +9,8 @@ SYSTEM = System(
     name="imported",
     modules={
         **{name: module for name, module in RENDERFORMER.modules.items() if name not in BEFORE},
-        "scene": "stages.s03_import:ImportScene",
-        "probe": "stages.s08_probe:ProbeImported",
+        "scene": "stages.renderformer.s03_import:ImportScene",
+        "probe": "stages.renderformer.s08_probe:ProbeImported",
     },
     groups=(*RENDERFORMER.groups, *BEFORE),
     packages=RENDERFORMER.packages,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from model.losses import LPIPS, NETWORKS
+from model.lpips import LPIPS, NETWORKS
 
 # torchvision's networks: convolutions by number, as (stride, padding), after which the features are compared; "pool" between
 WRITTEN_OUT = {

@@ -12,10 +12,10 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from model.config import ModelConfig  # noqa: E402
-from model.parallel import join  # noqa: E402
-from model.renderformer import RenderFormer  # noqa: E402
-from model.training import FitConfig, fit  # noqa: E402
+from model.renderformer.config import ModelConfig  # noqa: E402
+from model.renderformer.network import RenderFormer  # noqa: E402
+from model.renderformer.training import FitConfig, fit  # noqa: E402
+from model.training.parallel import join  # noqa: E402
 from tests.model.synthetic import batch  # noqa: E402
 from tests.model.test_config import MICRO  # noqa: E402
 

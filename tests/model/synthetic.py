@@ -16,7 +16,7 @@ def batch(
     padded: int = 0,
     textured: bool = False,
 ) -> dict[str, Any]:
-    """A training batch as ``model.training.fit`` reads it; a pure function of its arguments."""
+    """A training batch as ``model.renderformer.training.fit`` reads it; a pure function of its arguments."""
     rng = np.random.default_rng(step)
 
     def uniform(*shape: int, low: float = 0.0, high: float = 1.0) -> np.ndarray:

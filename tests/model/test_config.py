@@ -8,9 +8,9 @@ import shutil
 import pytest
 import torch
 
-from model import checkpoint
-from model.config import ModelConfig
-from model.renderformer import RenderFormer
+from model.renderformer import checkpoint
+from model.renderformer.config import ModelConfig
+from model.renderformer.network import RenderFormer
 
 MICRO = dict(
     latent_dim=128, num_layers=1, num_heads=1, dim_feedforward=64, num_register_tokens=2, texture_encode_patch_size=2,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from model.config import ModelConfig
-from model.initial import start_informed
-from model.inputs import Triangles
-from model.renderformer import RenderFormer
+from model.renderformer.config import ModelConfig
+from model.renderformer.initial import start_informed
+from model.renderformer.inputs import Triangles
+from model.renderformer.network import RenderFormer
 
 TINY = {
     "latent_dim": 128, "num_heads": 1, "dim_feedforward": 256, "num_layers": 1, "num_register_tokens": 2,

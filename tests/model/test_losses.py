@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from model.losses import LPIPS, image_loss, log_radiance, tone_map
+from model.lpips import LPIPS, tone_map
+from model.renderformer.losses import image_loss, log_radiance
 from tests.model.lpips import distance, write_weights
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from model import checkpoint
-from model.logs import LOG
-from model.training import BEST, LAST
+from model.renderformer import checkpoint
+from model.renderformer.training import BEST, LAST
+from model.training.logs import LOG
 
 RANKS = Path(__file__).with_name("ranks.py")
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from model import reference
-from model.config import ModelConfig
-from model.inputs import Triangles, constant_material, kept_cells, material_patches, textured_patches
-from model.layers import SelfAttention, Windows
-from model.renderformer import RenderFormer, from_patches, ray_directions, to_patches
+from checks.parity import difference
+from model.renderformer import reference
+from model.renderformer.config import ModelConfig
+from model.renderformer.inputs import Triangles, constant_material, kept_cells, material_patches, textured_patches
+from model.renderformer.layers import SelfAttention, Windows
+from model.renderformer.network import RenderFormer, from_patches, ray_directions, to_patches
 from tests.model.synthetic import batch
 from tests.model.test_config import MICRO
-from tests.parity import difference
 
 RESOLUTION = 16
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from model import checkpoint
-from model.config import ModelConfig
-from model.flops import forward_flops
-from model.logs import LOG
-from model.optimization import schedule
-from model.parallel import Group
-from model.renderformer import RenderFormer
-from model.training import BEST, LAST, FitConfig, fit, predict
+from model.renderformer import checkpoint
+from model.renderformer.config import ModelConfig
+from model.renderformer.flops import forward_flops
+from model.renderformer.network import RenderFormer
+from model.renderformer.training import BEST, LAST, FitConfig, fit, predict
+from model.training.logs import LOG
+from model.training.optimization import schedule
+from model.training.parallel import Group
 from tests.model.synthetic import batch
 from tests.model.test_config import MICRO
 
@@ -163,7 +163,7 @@ def test_best_and_last_are_kept(tmp_path):
     errors = [row["validation_log_error"] for row in rows if "validation_log_error" in row]
     assert summary["best_log_error"] == min(errors) < errors[-1] == summary["log_error"]
     last, best = (checkpoint.load(tmp_path / name)[0] for name in (LAST, BEST))
-    from model.training import evaluate
+    from model.renderformer.training import evaluate
 
     assert evaluate(best, [batch(1000)], ALONE)[0]["log_error"] == pytest.approx(min(errors), rel=1e-6)
     assert evaluate(last, [batch(1000)], ALONE)[0]["log_error"] == pytest.approx(errors[-1], rel=1e-6)

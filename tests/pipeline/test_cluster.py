@@ -22,8 +22,8 @@ from pipeline.cluster import CLUSTERS
 from pipeline.config import Limits
 from pipeline.errors import MachineError, UserError
 from pipeline.executor import PoolBroken
-from pipeline.files import read_sealed
-from pipeline.runner import run_pipeline
+from pipeline.run import run_pipeline
+from pipeline.store.files import read_sealed
 from pipeline.worker import PartTask
 
 pytest.importorskip("distributed", reason="Dask is not installed: pip install 'lightmill[dask]'")

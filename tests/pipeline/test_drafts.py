@@ -8,10 +8,10 @@ import pytest
 
 from pipeline import commands, runner
 from pipeline.errors import ItemsFailed
-from pipeline.files import read_sealed, write_sealed
 from pipeline.repair import repair
-from pipeline.runner import run_pipeline
+from pipeline.run import run_pipeline
 from pipeline.store import DRAFT, Store
+from pipeline.store.files import read_sealed, write_sealed
 from tests.pipeline.toy import Total
 
 BUG = {"n": 12, "fail": ["n011"]}  # two of the items are in its part

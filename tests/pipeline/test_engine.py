@@ -16,7 +16,7 @@ from pipeline import commands
 from pipeline.config import Section, added, parse, runtime
 from pipeline.errors import UserError
 from pipeline.keys import canonical, canonical_json, seed_for
-from pipeline.runner import run_pipeline
+from pipeline.run import run_pipeline
 from pipeline.stage import Record
 from pipeline.store import Store
 from pipeline.sweep import plan_of

@@ -1,7 +1,7 @@
 """What a run meets on a bad day, in real processes: kills, full and read-only disks, a jumping clock, a second runner, Ctrl-C.
 
 After each: what is committed is right, what was finished is not made again, the next run completes, and the message says what
-happened. tests/kills.py does the same hundreds of times.
+happened. checks/kills.py does the same hundreds of times.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from checks import kills
 from pipeline.errors import INTERRUPTED, ItemsFailed, MachineError, TooManyRejects
 from pipeline.store import Store
-from tests import kills
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -14,10 +14,10 @@ import pytest
 
 from pipeline import commands
 from pipeline.errors import Damaged, UserError
-from pipeline.listing import Row
 from pipeline.repair import repair, sound_parts
-from pipeline.runner import run_pipeline
+from pipeline.run import run_pipeline
 from pipeline.store import Artifact, Store
+from pipeline.store.listing import Row
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 
 from bench import scale
 from pipeline.hydra_config import compose
-from pipeline.runner import run_pipeline
+from pipeline.run import run_pipeline
 from pipeline.store import Store
 
 

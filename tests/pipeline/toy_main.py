@@ -4,7 +4,7 @@ import json
 import sys
 
 from pipeline.__main__ import guarded
-from pipeline.runner import run_pipeline
+from pipeline.run import run_pipeline
 
 
 def say(text: str) -> None:

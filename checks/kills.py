@@ -1,0 +1,375 @@
+"""Kills runs at random points and compares what they end with to an undisturbed run. Run by hand:
+
+    python checks/kills.py --what synthetic --kills 150 --seed 0
+    python checks/kills.py --what data --kills 50
+    python checks/kills.py --what train --kills 30
+
+*synthetic* is the toy system of tests/pipeline/toy.py, *data* the line from collect to shard, *train* training on such shards.
+A run is started, struck once or twice by SIGKILL (its runner; or one of its workers, after which it must go on by itself),
+started again and so on until one run ends; then digests (of training also the loss log) must be those of the undisturbed
+run, every byte must verify, and no part that was finished when a kill struck may have been written again. Then the next round
+begins from nothing. Half of the kills wait a random time, the others for a moment that is short: a part just finished, a
+listing, a manifest, a commit. Exits non-zero at any difference. ``--store`` keeps the undisturbed run for the next slice.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from pipeline.store import Store
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = (
+    "remesh.resolution=24", "decimate.budgets=[64]", "scene.count.train=6", "scene.count.validation=2", "scene.count.test=2",
+    "scene.cameras.views=2", "render.resolution=32", "render.max_spp=1", "shard.shard_mb=0.05",
+)  # fmt: skip
+TRAIN = (
+    "train.steps=40", "train.batch_scenes=2", "train.views_per_scene=2", "train.warmup=2", "train.ema=0.9",
+    "train.device=cpu", "train.threads=1", "train.log_every=1", "train.validate_every=13", "train.checkpoint_every=5",
+    "train.tensorboard=false", "model.latent_dim=128", "model.num_heads=1", "model.dim_feedforward=512", "model.num_layers=1",
+    "model.view_transformer_latent_dim=128", "model.view_transformer_n_heads=1", "model.view_transformer_ffn_hidden_dim=512",
+    "model.view_transformer_n_layers=4",
+)  # fmt: skip
+MEASURED = ("seconds", "scenes_per_s", "tokens_per_s", "memory_gb", "mfu")  # of a log row; all else must be equal
+# Pattern of what appears -> at most so many of them are waited for.
+COMMIT = {"{stage}/*.partial/items.jsonl": 1, "{stage}/*.partial/manifest.json": 1, "{stage}/*-*/manifest.json": 1}
+PARTS = {"{stage}/*.partial": 1, "{stage}/*.partial/markers/[!.]*.json": 4, "{stage}/*.partial/parts/*.tar": 4, **COMMIT}
+CHECKPOINTS = {"{stage}/*.partial/state/*": 1, "{stage}/*.partial/state/.*": 1, "{stage}/*.partial/files/*": 2, **COMMIT}
+KILLS_PER_ROUND = 6
+PATIENCE_S = 3600.0  # no run here takes so long, even on a busy machine: one that does hangs
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """What is killed: a command over a store, and the first stage that it makes anew in each round."""
+
+    command: Callable[[Path], list[str]]
+    stages: tuple[str, ...]  # made anew in each round; others are taken from the undisturbed run
+    begun: str = " running "  # in the output: from here on there is something to lose
+    moments: dict[str, int] = field(default_factory=lambda: PARTS)
+
+
+def meshes(folder: Path) -> Path:
+    """Eight small meshes, enough for three splits: boxes of different proportions."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(8):
+        x, y, z = 1.0, 1.0 + 0.2 * number, 0.5 + 0.1 * number**1.5
+        corners = [f"v {x * (i & 1)} {y * (i >> 1 & 1)} {z * (i >> 2)}" for i in range(8)]
+        faces = ("1 3 4 2", "5 6 8 7", "1 2 6 5", "3 7 8 4", "1 5 7 3", "2 4 8 6")
+        (folder / f"box{number}.obj").write_text("\n".join([*corners, *(f"f {face}" for face in faces), ""]))
+    return folder
+
+
+def line(stage: str, overrides: Sequence[str], stages: tuple[str, ...], **more: Any) -> Campaign:
+    def command(store: Path) -> list[str]:
+        source = ["collect=folder", f"collect.path={meshes(store.parent / 'meshes')}"]
+        where = [f"store={store}", f"hydra.run.dir={store}/.runs"]
+        return [sys.executable, "-m", "pipeline", f"stage={stage}", *where, *source, *overrides]
+
+    return Campaign(command, stages, **more)
+
+
+def synthetic(store: Path) -> list[str]:
+    numbers, squares = {"n": 30, "pause_s": 0.02}, {"finish_s": 0.05}
+    root = {"system": "tests.pipeline.toy", "stage": "total", "store": str(store), "workers": 2}
+    root |= {"numbers": numbers, "squares": squares, "total": {"pause_s": 0.1}}
+    return [sys.executable, "-m", "tests.pipeline.toy_main", json.dumps(root)]
+
+
+CAMPAIGNS = {
+    "synthetic": Campaign(synthetic, ("numbers", "squares", "total")),
+    "data": line("shard", DATA, ("collect", "remesh", "decimate", "scene", "render", "shard")),
+    "train": line("train", (*DATA, *TRAIN), ("train",), begun="parameters (", moments=CHECKPOINTS),
+}
+
+
+class Run:
+    """One process of a campaign, its output in a file."""
+
+    def __init__(self, campaign: Campaign, store: Path):
+        store.mkdir(parents=True, exist_ok=True)
+        self.campaign, self.store = campaign, store
+        self.output = store / ".output.txt"
+        with open(self.output, "w") as file:
+            self.process = subprocess.Popen(campaign.command(store), cwd=ROOT, stdout=file, stderr=subprocess.STDOUT)
+        self.began = time.monotonic()
+        self.at_work: float | None = None  # seconds after the start
+
+    def text(self) -> str:
+        return self.output.read_text()
+
+    def wait_until(self, ready: Callable[[], bool], pause_s: float = 0.002) -> bool:
+        """False if the process ended first."""
+        while not ready():
+            if self.process.poll() is not None:
+                return False
+            if time.monotonic() - self.began > PATIENCE_S:
+                self.process.kill()
+                raise SystemExit(f"a run hangs; its output:\n{self.text()}")
+            time.sleep(pause_s)
+        return True
+
+    def begin(self) -> bool:
+        found = self.wait_until(lambda: self.campaign.begun in self.text(), 0.01)
+        self.at_work = time.monotonic() - self.began
+        return found
+
+    def end(self) -> int:
+        self.wait_until(lambda: False, 0.01)
+        return self.process.returncode
+
+    def workers(self) -> list[psutil.Process]:
+        with contextlib.suppress(psutil.Error):
+            children = psutil.Process(self.process.pid).children()
+            return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+        return []
+
+
+def rows(path: Path) -> list[dict]:
+    """The complete lines of a loss log, less what was measured."""
+    found = []
+    for text in path.read_text().splitlines():
+        try:
+            found.append({name: value for name, value in json.loads(text).items() if name not in MEASURED})
+        except ValueError:
+            break
+    return found
+
+
+def draft_of(store: Path) -> Path | None:
+    """The draft at work: of several (one that another stage left) the newest."""
+    found = sorted(store.glob("[!.]*/*.partial"), key=lambda path: path.stat().st_mtime)
+    return found[-1] if found else None
+
+
+def where(store: Path) -> str:
+    """How far the run in the store is, for the table: stage and phase."""
+    with contextlib.suppress(OSError):
+        draft = draft_of(store)
+        if draft is None:
+            return "between stages"
+        phase = "parts"
+        if (draft / "manifest.json").exists():
+            phase = "commit, manifest"
+        elif (draft / "items.jsonl").exists():
+            phase = "commit, listings"
+        elif any((draft / "files").iterdir()):
+            phase = "files"
+        elif (draft / "state" / "log.jsonl").exists():
+            phase = "steps"
+        return f"{draft.parent.name}: {phase}"
+    return "between stages"
+
+
+def finished(store: Path) -> dict[tuple[str, str], int]:
+    """(stage, file) -> inode, of every part with a marker and every manifest of an artifact: what must not be made again."""
+    found = {}
+    for marker in store.glob("[!.]*/*.partial/markers/[!.]*.json"):
+        with contextlib.suppress(OSError, ValueError):
+            digest = json.loads(marker.read_bytes())["digest"]
+            if digest is not None:
+                path = marker.parents[1] / "parts" / f"{digest}.tar"
+                found[path.parents[2].name, path.name] = path.stat().st_ino
+    for manifest in store.glob("[!.]*/*-*/manifest.json"):
+        found[manifest.parents[1].name, manifest.name] = manifest.stat().st_ino
+        for path in manifest.parent.glob("parts/*.tar"):
+            found[path.parents[2].name, path.name] = path.stat().st_ino
+    return found
+
+
+def differences(calm: Path, killed: Path, stages: Sequence[str]) -> list[str]:
+    """What the killed run's artifacts have other than the undisturbed one's; empty where they are the same."""
+    found = []
+    for stage in stages:
+        wanted, got = Store(calm).artifacts(stage), Store(killed).artifacts(stage)
+        if len(wanted) != 1 or len(got) != 1:
+            found.append(f"{stage}: {len(got)} artifacts, not {len(wanted)}")
+            continue
+        (a,), (b,) = wanted, got
+        if (a.key, a.digest) != (b.key, b.digest):
+            found.append(f"{stage}: digest {b.digest[:12]}, not {a.digest[:12]}")
+        found += [f"{stage}: {problem}" for problem in b.verify(deep=True)]
+        logs = [artifact.path / "files" / "log.jsonl" for artifact in (a, b)]
+        if logs[0].exists() and rows(logs[0]) != rows(logs[1]):
+            found.append(f"{stage}: the loss logs differ")
+    found += [f"a draft is left: {draft.parent.name}/{draft.name}" for draft in Store(killed).drafts()]
+    return found
+
+
+@dataclass
+class Tally:
+    kills: int = 0
+    rounds: int = 0
+    starts: int = 0
+    retries: int = 0
+    again: int = 0  # finished parts that were written again
+    wrong: list[str] = field(default_factory=list)
+    struck: Counter = field(default_factory=Counter)
+
+
+class Striker:
+    """One seeded series of rounds."""
+
+    def __init__(self, campaign: Campaign, calm: Path, folder: Path, seed: int, work_s: float):
+        self.campaign, self.calm, self.folder, self.work_s = campaign, calm, folder, work_s
+        self.random = random.Random(seed)
+        self.tally = Tally()
+        self.kept: dict[tuple[str, str], int] = {}
+
+    def round(self, kills: int) -> None:
+        """Kill at most ``kills`` times, then let a run end, and compare."""
+        tally = self.tally
+        tally.rounds += 1
+        store = self.folder / f"round-{tally.rounds}"
+        ignored = shutil.ignore_patterns(*self.campaign.stages, ".*")
+        shutil.copytree(self.calm, store, ignore=ignored)
+        self.kept = {}
+        before, status = tally.kills, None
+        while status is None:
+            status = self.life(store, tally.kills - before < kills)
+        self.check_kept(store)
+        wrong = differences(self.calm, store, self.campaign.stages)
+        if status:
+            wrong.append(f"the last run ended with status {status}:\n{(store / '.output.txt').read_text()}")
+        tally.wrong += wrong
+        print(f"round {tally.rounds:3}: {tally.kills - before} kills, {'; '.join(wrong) or 'same digests'}", flush=True)
+        if not wrong:
+            shutil.rmtree(store)
+
+    def life(self, store: Path, may_kill: bool) -> int | None:
+        """One process: its exit status, or None if its runner was killed."""
+        self.tally.starts += 1
+        run = Run(self.campaign, store)
+        try:
+            if may_kill and run.begin():
+                to_worker = self.random.random() < 0.4 and "train" not in self.campaign.stages
+                struck = to_worker and self.strike(run, worker=True)
+                if (not struck or self.random.random() < 0.5) and self.strike(run, worker=False):
+                    return None
+            status = run.end()
+        finally:
+            run.process.kill()
+            run.process.wait()
+            text = run.text()
+            self.tally.retries += text.count("trying it once more") + text.count("starts again")
+        return status
+
+    def strike(self, run: Run, worker: bool) -> bool:
+        """Kill the runner or a worker at a random point; False if the run ended before."""
+        began = time.monotonic()
+        left = self.work_s * self.left(run.store)
+        if self.random.random() < 0.5:
+            delay = self.random.uniform(0, 0.9 * left)
+            aim = f"after {delay:.2f} s"
+            arrived = run.wait_until(lambda: time.monotonic() - began > delay)
+        else:
+            stage = self.random.choice(
+                [name for name in self.campaign.stages if not list(run.store.glob(f"{name}/*-*"))] or ["*"]
+            )
+            moments = self.campaign.moments
+            pattern = self.random.choice(list(moments))
+            number, jitter = self.random.randint(1, moments[pattern]), self.random.uniform(0, 0.004)
+            moment = pattern.format(stage=stage)
+            seen = len(list(run.store.glob(moment)))
+            if seen and "*" not in pattern.rpartition("/")[2]:  # left by an earlier kill: it will be there at once
+                seen = 0
+            arrived = run.wait_until(lambda: len(list(run.store.glob(moment))) >= seen + number, 0.0005)
+            time.sleep(jitter)
+            aim = f"at {moment}"
+        if worker:
+            run.wait_until(lambda: bool(run.workers()), 0.01)
+        targets = run.workers() if worker else [run.process]
+        if not arrived or not targets or run.process.poll() is not None:
+            return False
+        place = where(run.store)
+        with contextlib.suppress(psutil.Error):
+            self.random.choice(targets).kill()
+        if not worker and run.process.wait() != -signal.SIGKILL:  # it ended just before
+            return False
+        self.check_kept(run.store)
+        self.kept = finished(run.store)
+        who = "worker" if worker else "runner"
+        self.tally.kills += 1
+        self.tally.struck[place, who] += 1
+        print(f"  kill {self.tally.kills:3}: {who} {aim:<44} {place}", flush=True)
+        return True
+
+    def check_kept(self, store: Path) -> None:
+        """Count what was finished at the last kill and has been written again since."""
+        now = finished(store)
+        again = [key for key, inode in self.kept.items() if key in now and now[key] != inode and key[1] != "manifest.json"]
+        self.tally.again += len(again)
+        self.tally.wrong += [f"{stage}: part {name} was finished and made again" for stage, name in again]
+
+    def left(self, store: Path) -> float:
+        """Share of the work that is left, roughly: artifacts or parts against the undisturbed run's."""
+        logs = list(store.glob("train/*.partial/state/log.jsonl"))
+        if "train" in self.campaign.stages:
+            whole = rows(Store(self.calm).resolve("train").file("log.jsonl"))[-1]["step"]
+            done = [row["step"] for row in rows(logs[0])] if logs else []
+            return 1 - (max(done, default=0) / whole)
+        whole = len(list(self.calm.glob("[!.]*/*/parts/*.tar")))
+        return max(0.1, 1 - len(list(store.glob("[!.]*/*/parts/*.tar"))) / whole)
+
+
+def undisturbed(campaign: Campaign, store: Path) -> tuple[float, float]:
+    """Make the artifacts to compare with, where they are missing. Returns seconds until work began, and of work."""
+    stages = [stage for stage in campaign.stages if (store / stage).exists()]
+    for stage in stages:
+        shutil.rmtree(store / stage)
+    run = Run(campaign, store)
+    run.begin()
+    if run.end():
+        raise SystemExit(f"a run that nobody killed failed:\n{run.text()}")
+    return run.at_work or 0.0, time.monotonic() - run.began - (run.at_work or 0.0)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--what", choices=tuple(CAMPAIGNS), default="synthetic")
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--store", type=Path, help="folder that keeps what the campaign reads (train: shards) for other slices")
+    arguments = parser.parse_args(words)
+    campaign = CAMPAIGNS[arguments.what]
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        calm = (arguments.store or Path(folder)) / f"calm-{arguments.what}"
+        start_s, work_s = undisturbed(campaign, calm)
+        print(f"undisturbed: {start_s:.1f} s until work begins, {work_s:.1f} s of work", flush=True)
+        striker = Striker(campaign, calm, Path(folder) / "killed", arguments.seed, work_s)
+        tally = striker.tally
+        while tally.kills < arguments.kills and not tally.wrong:
+            striker.round(min(KILLS_PER_ROUND, arguments.kills - tally.kills))
+        elapsed = time.monotonic() - began
+        print(f"\n{'struck':<40} {'runner':>7} {'worker':>7}")
+        for place in sorted({place for place, _ in tally.struck}):
+            print(f"{place:<40} {tally.struck[place, 'runner']:>7} {tally.struck[place, 'worker']:>7}")
+        print(
+            f"\n{arguments.what}, seed {arguments.seed}: {tally.kills} kills in {tally.rounds} rounds, {tally.starts} starts, "
+            f"{tally.retries} retries, {tally.again} finished parts made again, "
+            f"{len(tally.wrong)} differences; {elapsed:.0f} s, {elapsed / max(tally.kills, 1):.1f} s a kill"
+        )
+        for problem in tally.wrong:
+            print(f"DIFFERENT: {problem}")
+    return 1 if tally.wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

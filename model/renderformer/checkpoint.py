@@ -1,0 +1,85 @@
+"""Released-format checkpoint folders: ``config.json`` and ``model.safetensors``, read and written strictly.
+
+What a model was trained with travels in the safetensors header's metadata, which other readers ignore.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from model.errors import InputError
+from model.files import replace
+from model.renderformer.config import ModelConfig
+from model.renderformer.network import RenderFormer
+
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+
+
+def save(
+    config: ModelConfig, weights: Mapping[str, Tensor], folder: Path, trained_with: Mapping[str, str] | None = None
+) -> None:
+    """Write the folder from a network's config and state dict; each file appears whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    state = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
+    metadata = {"format": "pt", **(trained_with or {})}
+    temporary = folder / (WEIGHTS + ".tmp")
+    save_file(state, temporary, metadata)
+    _sort_metadata(temporary)
+    replace(temporary, folder / WEIGHTS)
+    temporary = folder / (CONFIG + ".tmp")
+    temporary.write_text(config.dumps())
+    replace(temporary, folder / CONFIG)
+
+
+def _sort_metadata(path: Path) -> None:
+    """Put the header's metadata in sorted order: safetensors writes it in a random one, so equal models would differ."""
+    with path.open("r+b") as file:
+        size = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(size))
+        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+        data = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(size)
+        if len(data) != size:
+            raise AssertionError(f"header of {path} changed its length")
+        file.seek(8)
+        file.write(data)
+
+
+def _check_shapes(config: ModelConfig, stored: Mapping[str, tuple[int, ...]], path: Path) -> None:
+    """That the file holds the network which the config asks for, before a byte of either is allocated."""
+    layers = config.num_layers + config.view_transformer_n_layers
+    if layers > len(stored):
+        raise InputError(f"{path} holds {len(stored)} tensors, {CONFIG} asks for {layers} layers")
+    with torch.device("meta"):
+        own = {name: tuple(tensor.shape) for name, tensor in RenderFormer(config).state_dict().items()}
+    for what, which in (("unknown", stored.keys() - own.keys()), ("missing", own.keys() - stored.keys())):
+        if which:
+            raise InputError(f"{path}: {what} parameter {', '.join(sorted(which))} for the network of {CONFIG}")
+    for name, shape in stored.items():
+        if shape != own[name]:
+            raise InputError(f"{path}: {name} has shape {shape}, {CONFIG} asks for {own[name]}")
+
+
+def load(folder: Path) -> tuple[RenderFormer, dict[str, str]]:
+    """The model, on the CPU in float32 and in eval mode, and what it says it was trained with (may be empty)."""
+    folder = Path(folder)
+    config = ModelConfig.load(folder / CONFIG)
+    path = folder / WEIGHTS
+    if not path.is_file():
+        raise InputError(f"{path} is missing: a checkpoint folder holds {CONFIG} and {WEIGHTS}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            _check_shapes(config, {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}, path)  # noqa: SIM118
+            state = {name: file.get_tensor(name) for name in sorted(file.keys())}
+    except SafetensorError as error:
+        raise InputError(f"{path} is not a safetensors file: {error}") from None
+    model = RenderFormer(config)
+    model.load_state_dict(state)
+    return model.eval(), {name: value for name, value in metadata.items() if name != "format"}

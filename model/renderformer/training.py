@@ -1,0 +1,362 @@
+"""The training loop (section 3.3): resumable, and after a kill exactly the run that it would have been.
+
+Reads batches that are a pure function of the step; writes into the folder it is given ``training.pt`` (what is needed to go
+on), ``log.jsonl``, and in the released format ``last/`` (at the end) and ``best/`` (lowest validation error so far). The one
+design choice: everything that changes from step to step is in ``training.pt``, replaced atomically, and the log is cut back to
+that step on resume, so nothing is logged twice. Many processes (``model.training.parallel``) follow the run of one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from model.errors import InputError
+from model.files import replace
+from model.lpips import LPIPS
+from model.renderformer import checkpoint
+from model.renderformer.flops import TRAINING, forward_flops, ideal_seconds, peak_flops
+from model.renderformer.losses import image_loss, log_radiance
+from model.renderformer.network import RenderFormer, to_radiance
+from model.training.logs import TrainingLog
+from model.training.optimization import Average, optimizers, schedule, set_learning_rate
+from model.training.parallel import Group, accumulating, distribute, gather, scatter
+
+STATE, LAST, BEST = "training.pt", "last", "best"
+PATIENCE = 20  # this many non-finite steps in a row stop the run
+
+Batch = Mapping[str, Any]
+Pair = tuple[np.ndarray, np.ndarray]  # a reference and a prediction, each (H, W, 3) radiance
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How to train; the paper's values are in ``conf/train/paper_256.yaml``."""
+
+    steps: int
+    lr: float = 1e-4
+    warmup: int = 8000  # steps of linear warm-up
+    decay_steps: int | None = None  # step at which the cosine ends; None: the last
+    final_lr: float = 0.0  # learning rate after the cosine, as a share of lr
+    weight_decay: float = 0.01  # on matrices; norms, biases and tokens are left alone
+    clip: float = 1.0  # largest gradient norm
+    optimizer: str = "adamw"  # adamw | muon (2-D hidden weights; AdamW for the rest)
+    muon_lr: float = 0.02  # highest learning rate of Muon's weights: the size of a step in spectral norm
+    ema: float = 0.0  # decay of the averaged weights, which are then the ones validated and saved; 0: none
+    lpips: float = 0.0  # weight of LPIPS(VGG)
+    gradient_leak: float = 0.0  # gradient, beyond ELU's own, of pixels that come out negative: without it they can die
+    # Runtime: these do not change the result, or only its rounding
+    lpips_folder: Path | None = None
+    precision: str = "fp32"  # fp32 | mixed (view-independent stage in bfloat16, TF32 in the other) | bf16
+    micro_scenes: int | None = None  # scenes of a process in memory at once; gradients of the parts add up. None: all
+    activation_checkpointing: bool = False
+    sharded: bool = False  # FSDP instead of DDP, where there are several processes
+    compile: bool = False
+    log_every: int = 50
+    validate_every: int = 1000
+    checkpoint_every: int = 500
+    pictures: int = 6  # validation scenes shown
+
+    RUNTIME = (
+        "lpips_folder", "precision", "micro_scenes", "activation_checkpointing", "sharded", "compile", "log_every",
+        "validate_every", "checkpoint_every", "pictures",
+    )  # fmt: skip
+
+    def identity(self) -> dict[str, Any]:
+        return {name: value for name, value in dataclasses.asdict(self).items() if name not in self.RUNTIME}
+
+
+def predict(forward: Callable[..., Tensor], model: RenderFormer, batch: Batch, device: Any, precision: str) -> Tensor:
+    """(B, V, H, W, 3) log10(1 + radiance) for the batch's cameras, at its images' size."""
+    cameras = torch.from_numpy(np.ascontiguousarray(batch["camera_to_world"])).to(device, non_blocking=True)
+    fov = torch.from_numpy(np.ascontiguousarray(batch["fov_deg"])).to(device, non_blocking=True)
+    return forward(model.read(batch, device), cameras, fov, tuple(batch["image"].shape[2:4]), precision)
+
+
+def evaluate(
+    model: RenderFormer, batches: Sequence[Batch], group: Group, precision: str = "fp32", pictures: int = 0
+) -> tuple[dict[str, float], list[Pair]]:
+    """Means over all views: ``log_error`` (L1 of log10(1 + x)) and ``psnr`` of linear radiance clamped to [0, 1], in dB.
+
+    Each process measures its share of the batches. Also the first views of the first ``pictures`` batches (of its share).
+    """
+    sums = torch.zeros(3, dtype=torch.float64)
+    pairs: list[Pair] = []
+    model.eval()
+    with torch.no_grad():
+        for number, batch in _share(batches, group):
+            y = predict(model, model, batch, group.device, precision).float()
+            image = torch.from_numpy(np.ascontiguousarray(batch["image"])).to(group.device)
+            errors = (y - log_radiance(image)).abs().mean(dim=(2, 3, 4)).flatten()
+            mse = (to_radiance(y).clamp(0, 1) - image.clamp(0, 1)).square().mean(dim=(2, 3, 4)).flatten()
+            psnrs = -10 * torch.log10(mse.clamp(min=1e-10))
+            if number is not None:
+                sums += torch.stack([errors.sum(), psnrs.sum(), torch.tensor(float(len(errors)))]).double().cpu()
+                if number < pictures:
+                    pairs.append((batch["image"][0, 0], to_radiance(y[0, 0]).cpu().numpy()))
+    model.train()
+    error, psnr, count = group.mean(sums.to(group.device)).tolist()
+    return {"log_error": error / count, "psnr": psnr / count}, pairs
+
+
+def _share(batches: Sequence[Batch], group: Group) -> Iterator[tuple[int | None, Batch]]:
+    """(number, batch) of this process; all take part equally often (FSDP), with number None where one stands in."""
+    for first in range(0, len(batches), group.world):
+        number = first + group.rank
+        yield (number, batches[number]) if number < len(batches) else (None, batches[first])
+
+
+def parts(batch: Batch, most: int | None) -> Iterator[tuple[Batch, float, bool]]:
+    """The batch in parts of at most ``most`` scenes, each with its share of the scenes and whether it is the last."""
+    scenes = len(batch["mask"])
+    most = most or scenes
+    for first in range(0, scenes, most):
+        last = min(first + most, scenes)
+        # Textures are shared by the batch's scenes, which refer to them by row.
+        part = {name: value if name == "patches" else value[first:last] for name, value in batch.items()}
+        yield part, (last - first) / scenes, last == scenes
+
+
+class Work:
+    """Scenes, tokens and floating-point operations since the last log line, for rates and utilisation."""
+
+    def __init__(self, model: RenderFormer, group: Group, precision: str):
+        self.model, self.group, self.precision = model, group, precision
+        self.peaks = {"float32": peak_flops(str(group.device), "float32")}
+        if precision != "fp32":
+            self.peaks["bfloat16"] = peak_flops(str(group.device), "bfloat16")
+        self.start()
+
+    def start(self) -> None:
+        self.began, self.scenes, self.tokens, self.ideal = time.perf_counter(), 0, 0, 0.0
+
+    def add(self, batch: Batch) -> None:
+        """One training step; padding is not counted."""
+        config = self.model.config
+        triangles = batch["mask"].sum(axis=1).tolist()
+        views, height, width = batch["image"].shape[1:4]
+        rays = views * (height // config.patch_size) * (width // config.patch_size)
+        textured = int((batch["patch_index"] >= 0).sum()) if "patch_index" in batch else 0
+        self.scenes += len(triangles)
+        self.tokens += sum(triangles) + len(triangles) * (config.num_register_tokens + rays)
+        flops = forward_flops(config, triangles, views, height, width, textured)
+        self.ideal += TRAINING * ideal_seconds(flops, self.peaks, self.precision)
+
+    def rates(self) -> dict[str, float]:
+        """Over all processes, which do equal work; ``mfu``: time at the rate of a large matrix product, over elapsed time."""
+        elapsed = time.perf_counter() - self.began
+        return {
+            "scenes_per_s": round(self.group.world * self.scenes / elapsed, 3),
+            "tokens_per_s": round(self.group.world * self.tokens / elapsed, 1),
+            "memory_gb": round(_memory_gb(self.group.device), 3),
+            "mfu": round(self.ideal / elapsed, 4),
+        }
+
+
+def _memory_gb(device: torch.device) -> float:
+    """Peak memory so far: of the GPU, or of this process."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**30
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+class _State:
+    """All that changes from step to step, as one file: whole tensors, however many processes there are."""
+
+    PLAIN = ("step", "skipped", "skipped_in_a_row", "seconds", "window", "best")
+
+    def __init__(self, model: RenderFormer, config: FitConfig, folder: Path, group: Group):
+        self.model, self.config, self.path, self.group = model, config, folder / STATE, group
+        self.optimizers = optimizers(model, config.optimizer, config.lr, config.muon_lr, config.weight_decay)
+        self.average = Average(model, config.ema) if config.ema else None
+        self.step = 0  # steps done: also the position in the data
+        self.skipped = 0
+        self.skipped_in_a_row = 0
+        self.seconds = 0.0
+        self.window: list[list[float]] = []  # loss, gradient norm of the steps since the last log line
+        self.best: float | None = None  # lowest validation log error so far
+
+    def save(self) -> None:
+        whole = {
+            "identity": self._identity(),
+            "plain": {name: getattr(self, name) for name in self.PLAIN},
+            "model": gather(self.model.state_dict()),
+            "optimizers": [gather(optimizer.state_dict()) for optimizer in self.optimizers],
+            "average": gather(self.average.values) if self.average else None,
+            "rng": {"cpu": torch.get_rng_state()},
+        }
+        if torch.cuda.is_available():
+            whole["rng"]["cuda"] = torch.cuda.get_rng_state()
+        if self.group.leads:
+            temporary = self.path.with_suffix(".tmp")
+            torch.save(whole, temporary)
+            replace(temporary, self.path)
+
+    def load(self) -> bool:
+        """Whether there was something to go on from."""
+        if not self.path.is_file():
+            return False
+        saved = torch.load(self.path, map_location="cpu", weights_only=True)
+        if saved["identity"] != self._identity():
+            raise InputError(f"{self.path} belongs to a training run of another configuration: give it another folder")
+        own = self.model.state_dict()
+        self.model.load_state_dict({name: scatter(value, own[name]) for name, value in saved["model"].items()})
+        for optimizer, state in zip(self.optimizers, saved["optimizers"], strict=True):
+            parameters = [p for group in optimizer.param_groups for p in group["params"]]
+            for index, values in state["state"].items():
+                for name, value in values.items():
+                    if isinstance(value, Tensor):
+                        values[name] = scatter(value, parameters[index])
+            optimizer.load_state_dict(state)
+        if self.average is not None:
+            for name, value in saved["average"].items():
+                self.average.values[name].copy_(scatter(value, self.average.values[name]))
+        torch.set_rng_state(saved["rng"]["cpu"])
+        if "cuda" in saved["rng"] and torch.cuda.is_available():
+            torch.cuda.set_rng_state(saved["rng"]["cuda"])
+        for name, value in saved["plain"].items():
+            setattr(self, name, value)
+        return True
+
+    def averaged(self) -> Any:
+        """A context in which the model has the weights that count: the averaged ones, if there are any."""
+        return self.average.in_place() if self.average else nullcontext()
+
+    def release(self, folder: Path, trained_with: Mapping[str, str] | None) -> None:
+        """Save the weights that count as a released-format checkpoint."""
+        with self.averaged():
+            weights = gather(self.model.state_dict())
+            if self.group.leads:
+                checkpoint.save(self.model.config, weights, folder, trained_with)
+
+    def _identity(self) -> str:
+        return json.dumps([self.model.config.to_dict(), self.config.identity()], sort_keys=True)
+
+
+def fit(
+    model: RenderFormer,
+    config: FitConfig,
+    batches: Callable[[int, int], Iterable[Batch]],
+    validation: Sequence[Batch],
+    folder: Path,
+    group: Group,
+    say: Callable[[str], None] = print,
+    show: Callable[[int, list[Pair]], np.ndarray] | None = None,
+    tensorboard: Path | None = None,
+    trained_with: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """Train ``model`` in place up to ``config.steps``, going on from ``folder`` if it holds a state.
+
+    ``batches(start, stop)`` yields the batches of those steps, each a pure function of its step and this process's slice of the
+    global batch: dicts of numpy arrays as ``model.renderformer.inputs.scenes_of`` reads them, with camera_to_world (B, V, 4,
+    4), fov_deg (B, V) and image (B, V, H, W, 3) radiance. ``validation`` is a fixed list of such; ``show`` makes a picture of
+    some views. ``trained_with`` goes into the checkpoints. Returns steps, skipped, seconds, and the last and best
+    validation's metrics.
+    """
+    if config.precision not in ("fp32", "mixed", "bf16"):
+        raise InputError(f"precision={config.precision!r} is unknown: fp32, mixed or bf16")
+    folder.mkdir(parents=True, exist_ok=True)
+    model.to(group.device).train()
+    model.view_transformer.gradient_leak = config.gradient_leak
+    model.activation_checkpointing(config.activation_checkpointing)
+    if config.precision != "fp32" and group.device.type == "cuda":
+        torch.set_float32_matmul_precision("high")
+    if config.compile:
+        model.compile_layers()
+    lpips = LPIPS.load(config.lpips_folder).to(group.device) if config.lpips > 0 else None
+    forward = distribute(model, group, config.sharded)
+    state = _State(model, config, folder, group)
+    if state.load() and group.leads:
+        say(f"going on from step {state.step:,} of {config.steps:,}")
+    parameters = [p for optimizer in state.optimizers for one in optimizer.param_groups for p in one["params"]]
+    work = Work(model, group, config.precision)
+    # Only the first process writes. All have read the state by now, and none goes on before the log is cut.
+    log = TrainingLog(*((folder, tensorboard) if group.leads else (None, None)), state.step, config.steps,
+                      say if group.leads else lambda text: None)  # fmt: skip
+    group.wait()
+    metrics: dict[str, float] = {}
+
+    def validate() -> dict[str, float]:
+        with state.averaged():
+            found, pairs = evaluate(model, validation, group, config.precision, config.pictures if show else 0)
+        if state.best is None or found["log_error"] < state.best:
+            state.best = found["log_error"]
+            state.release(folder / BEST, trained_with)
+        if pairs and group.leads:
+            log.picture("validation/reference above, prediction below", show(state.step, pairs), state.step)
+        return found
+
+    base_seconds, began = state.seconds, time.perf_counter()
+    work.start()
+    for step, batch in enumerate(batches(state.step, config.steps), start=state.step):
+        share = schedule(step, config.steps, config.warmup, config.decay_steps, config.final_lr)
+        set_learning_rate(state.optimizers, share)
+        loss = torch.zeros((), device=group.device)
+        for part, weight, last in parts(batch, config.micro_scenes):
+            with accumulating(forward, last):
+                y = predict(forward, model, part, group.device, config.precision)
+                image = torch.from_numpy(np.ascontiguousarray(part["image"])).to(group.device, non_blocking=True)
+                part_loss = weight * image_loss(y, image, lpips, config.lpips)
+                part_loss.backward()
+                loss += part_loss.detach()
+        norm = gather(nn.utils.clip_grad_norm_(parameters, config.clip))
+        loss_value, norm_value = torch.stack([group.mean(loss), norm]).tolist()
+        if math.isfinite(loss_value) and math.isfinite(norm_value):
+            for optimizer in state.optimizers:
+                optimizer.step()
+            if state.average is not None:
+                state.average.update()
+            state.window.append([loss_value, norm_value])
+            state.skipped_in_a_row = 0
+        else:
+            state.skipped += 1
+            state.skipped_in_a_row += 1
+            if state.skipped_in_a_row >= PATIENCE:
+                scenes = ", ".join(str(i) for i in batch.get("ids", ())) or "not named"
+                raise InputError(
+                    f"training stopped at step {step}: loss {loss_value}, gradient norm {norm_value}, not finite for "
+                    f"{PATIENCE} steps in a row; look at the scenes of this batch ({scenes}), or try a smaller lr"
+                )
+        for optimizer in state.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        state.step = step + 1
+        state.seconds = base_seconds + time.perf_counter() - began
+        work.add(batch)
+        last = state.step == config.steps
+
+        if state.step % config.log_every == 0 or last:
+            mean_loss, mean_norm = np.mean(state.window, axis=0).tolist() if state.window else (None, None)
+            log.interval(
+                {"step": state.step, "loss": mean_loss, "lr": share * config.lr, "grad_norm": mean_norm}
+                | {"skipped": state.skipped, "seconds": round(state.seconds, 3)}
+                | work.rates()
+            )
+            state.window = []
+            work.start()
+        if validation and (state.step % config.validate_every == 0 or last):
+            before, metrics = state.best, validate()
+            log.validation(state.step, metrics, state.best != before)
+            work.start()
+        if state.step % config.checkpoint_every == 0 or last:
+            state.save()
+    if validation and not metrics:  # killed between the last step and the product: everything was done already
+        metrics = validate()
+    state.release(folder / LAST, trained_with)
+    log.close()
+    group.wait()
+    model.eval()
+    summary = {"steps": state.step, "skipped": state.skipped, "seconds": round(state.seconds, 1)} | metrics
+    return summary | ({"best_log_error": state.best} if state.best is not None else {})

@@ -1,0 +1,322 @@
+"""The store: a folder of artifacts, found by key, made from drafts, kept by pins and recent use."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import time
+import uuid
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pipeline.errors import Damaged, MachineError, UserError
+from pipeline.store.artifact import DRAFT, Artifact, read_draft
+from pipeline.store.claim import Claim
+from pipeline.store.draft import UNKNOWN, WORKING, Draft
+from pipeline.store.files import (
+    sync,
+    write_atomic,
+    write_sealed,
+)
+
+TRASH = (".trash/*", "[!.]*/.gone-*", "[!.]*/*/.gone-*")  # the last two: how an earlier gc named what it was deleting
+
+
+class Store:
+    """A folder of artifacts."""
+
+    def __init__(self, root: Path | str):
+        self.root = Path(root).absolute()
+        self._nodes: dict[Path, tuple[Any, _Node]] = {}  # artifacts as gc saw them last
+
+    # -- finding
+
+    def folder(self, stage: str, key: str) -> Path | None:
+        """The folder of the committed artifact, sound or damaged."""
+        return next(iter((self.root / stage).glob(f"[!.]*-{key[:12]}")), None)
+
+    def find(self, stage: str, key: str) -> Artifact | None:
+        """The committed artifact; an error where its manifest is damaged."""
+        path = self.folder(stage, key)
+        return Artifact(path) if path is not None and Artifact(path).key == key else None
+
+    def artifacts(self, stage: str | None = None) -> list[Artifact]:
+        """All committed artifacts whose manifests can be read, oldest first."""
+        found = []
+        for path in self.folders(stage):
+            with contextlib.suppress(Damaged):
+                artifact = Artifact(path)
+                found.append((artifact.manifest["finished"], str(path), artifact))
+        return [artifact for _, _, artifact in sorted(found, key=lambda entry: entry[:2])]
+
+    def folders(self, stage: str | None = None) -> list[Path]:
+        """The folders of all committed artifacts, sound or damaged."""
+        found = self.root.glob(f"{stage or '[!.]*'}/[!.]*-" + "[0-9a-f]" * 12)
+        return sorted(path for path in found if (path / "manifest.json").exists() or (path / DRAFT).exists())
+
+    def drafts(self) -> list[Path]:
+        return sorted(self.root.glob("[!.]*/[!.]*.partial"))
+
+    def resolve(self, reference: str) -> Artifact:
+        """The artifact that a person means: a key or its beginning, ``stage/folder``, a folder, or a stage's newest."""
+        path = Path(reference)
+        for folder in (path, self.root / reference if ".." not in path.parts else path):
+            if (folder / "manifest.json").is_file() or ((folder / DRAFT).is_file() and folder.suffix != ".partial"):
+                return Artifact(folder)
+        stage, _, rest = reference.rpartition("/")
+        if not stage and (newest := self.artifacts(reference) if reference.isidentifier() else []):
+            return newest[-1]
+        token = rest.rpartition("-")[2]
+        found = [Artifact(path) for path in self.folders(stage or None) if len(token) >= 4 and self._is_key(token, path)]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise UserError(f"{reference!r} is the beginning of {len(found)} keys: give more letters")
+        raise UserError(f"no artifact {reference!r} in {self.root}: `lightmill ls` lists what is there")
+
+    @staticmethod
+    def _is_key(token: str, folder: Path) -> bool:
+        """Whether the artifact's key begins so. Its folder has twelve letters of it, which is all there is if it is damaged."""
+        if not folder.name[-12:].startswith(token[:12]):
+            return False
+        with contextlib.suppress(Damaged):
+            return Artifact(folder).key.startswith(token)
+        return True
+
+    # -- making
+
+    def draft(
+        self,
+        stage: str,
+        key: str,
+        preimage: Mapping[str, Any],
+        out: Any = print,
+        origin: Mapping[str, Any] | None = None,
+        purpose: str = "make",
+        code: str = UNKNOWN,
+    ) -> Draft:
+        """A new draft, or the one that an interrupted run left.
+
+        ``origin``: what it takes to make it anew (system, config). ``purpose``: make, force or repair; what force did not begin
+        itself it sets aside. ``code``: the digest of the code at work.
+        """
+        path = self.draft_path(stage, key)
+        before = read_draft(path)
+        begun = any(any((path / folder).glob("[!.]*")) for folder in ("markers", "state"))
+        if begun and purpose == "force" and (before or {}).get("purpose") != "force":
+            aside = self.trash(path)
+            out(f"   note: force takes nothing of what an earlier run had finished; that is in {aside} until gc deletes it")
+            before, begun = None, False
+        draft = Draft(path, stage, key, preimage, out)
+        about = {"key": key, "preimage": draft.preimage, "started": time.time(), **(origin or {})} if before is None else before
+        others = [other for other in about.get("codes", [UNKNOWN]) if other != code] if begun else []
+        if others and code != UNKNOWN:
+            whose = "code that nobody noted" if others == [UNKNOWN] else "other code of the same version"
+            out(f"   note: what is finished of {stage} was made by {whose}; it is kept (to begin anew, delete {path})")
+        facts = {"purpose": purpose, "codes": [*others, code]}
+        if before is None or not facts.items() <= before.items():
+            write_sealed(path / DRAFT, {**about, **facts})
+        return draft
+
+    def draft_path(self, stage: str, key: str) -> Path:
+        return self.root / stage / f"{key}.partial"
+
+    def claim(self, stage: str, key: str) -> Claim:
+        return Claim(self.root / stage / f".{key}.claim")
+
+    def commit(self, draft: Draft, slug: str, manifest: Mapping[str, Any], replace: bool = False) -> Artifact:
+        """Make the draft an artifact by one rename.
+
+        If the target exists by then, ours is dropped, or swapped in on ``replace``.
+        """
+        used = {marker["digest"] for marker in draft._markers}
+        for path in (draft.path / "parts").iterdir():
+            if path.suffix != ".tar" or path.stem not in used:
+                path.unlink()  # orphans: temporaries of killed workers, parts of another plan
+        write_sealed(draft.path / "manifest.json", manifest)
+        for folder in ("parts", "files", "."):
+            sync(draft.path / folder)
+        problems = Artifact(draft.path).verify()
+        if problems:  # somebody else is at work in the same draft after all
+            raise MachineError(f"{draft.path} changed while it was being committed ({problems[0]}): run the same command again")
+        old = self.folder(draft.stage, draft.key)
+        if old is not None and not replace and not Artifact(old).verify():
+            shutil.rmtree(draft.path)
+            target = old
+        else:
+            target = self.root / draft.stage / f"{slug}-{draft.key[:12]}"
+            if old is not None:
+                self.trash(old)
+            os.replace(draft.path, target)
+            sync(target.parent)
+            for folder in WORKING:  # only now: until the rename they are what a resume needs
+                shutil.rmtree(target / folder, ignore_errors=True)
+        self.touch(draft.key)
+        return Artifact(target)
+
+    # -- use, pins, garbage
+
+    def touch(self, key: str) -> None:
+        """Remember that the artifact was used just now (outside the artifact, which never changes)."""
+        path = self.root / ".used" / key
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+        except OSError:
+            pass  # a read-only store can still be read
+
+    def last_used(self, artifact: Artifact) -> float:
+        return self._used(artifact.key, artifact.manifest["finished"])
+
+    def _used(self, key: str, made: float) -> float:
+        path = self.root / ".used" / key
+        return path.stat().st_mtime if path.exists() else made
+
+    def pinned(self, key: str) -> bool:
+        return (self.root / ".pins" / key).exists()
+
+    def pin(self, key: str, on: bool = True) -> None:
+        path = self.root / ".pins" / key
+        if on:
+            write_atomic(path, b"")
+        else:
+            path.unlink(missing_ok=True)
+
+    def trash(self, path: Path) -> Path:
+        """Take a folder of the store out of sight by one rename; returns where it lies until gc empties the trash."""
+        aside = self.root / ".trash" / f"{'-'.join(path.relative_to(self.root).parts)}-{uuid.uuid4().hex[:8]}"
+        aside.parent.mkdir(exist_ok=True)
+        os.replace(path, aside)
+        return aside
+
+    def garbage(self, days: float, claimed: str | None = None) -> list[tuple[Path, str]]:
+        """What can go, with the reason: trash, drafts nobody works on, and artifacts nobody needs.
+
+        An artifact is needed while it is pinned, was used within ``days``, or is an input of an artifact that is needed or of
+        a draft that is kept. ``claimed``: a key whose claim the caller holds itself.
+        """
+        horizon = time.time() - days * 86400
+        found: list[tuple[Path, str]] = []
+        for pattern in TRASH:
+            found += [(path, "trash: replaced or set aside, or left by an interrupted gc") for path in self.root.glob(pattern)]
+        nodes = [node for path in self.folders() if (node := self._node(path)) is not None]
+        todo = [
+            node.key for node in nodes if node.damaged or self.pinned(node.key) or self._used(node.key, node.made) >= horizon
+        ]
+        for path in self.drafts():
+            key = path.name.removesuffix(".partial")
+            held = key != claimed and self.claim(path.parent.name, key).holder() is not None
+            if not held and not _changed_since(path, horizon):
+                found.append((path, f"unfinished and untouched for {days:g} days"))
+            elif (draft := read_draft(path)) is not None:
+                todo += draft["preimage"]["inputs"].values()
+            else:  # damaged, or not written yet: any artifact may be its input
+                todo += [node.key for node in nodes]
+        inputs = {node.key: node.inputs for node in nodes}
+        needed: set[str] = set()
+        while todo:
+            if (key := todo.pop()) not in needed:
+                needed.add(key)
+                todo += inputs.get(key, ())
+        for node in sorted(nodes, key=lambda node: node.made, reverse=True):
+            if node.key not in needed:
+                found.append((node.path, f"not pinned, not used for {days:g} days"))
+            else:
+                left = [node.path / name for name in WORKING if (node.path / name).exists()]
+                found += [(path, "left over by a commit that was interrupted") for path in left]
+        return found
+
+    def remove(self, path: Path, days: float) -> bool:
+        """Delete what ``garbage(days)`` listed, unless somebody works on it or has come to need it since; says whether.
+
+        Out of sight first, so that a kill in the middle leaves no half artifact.
+        """
+        stage, name = path.relative_to(self.root).parts[:2]
+        if stage != ".trash" and not path.name.startswith(".gone-"):
+            node = None if name.endswith(".partial") else self._node(self.root / stage / name)
+            key = node.key if node is not None else name.removesuffix(".partial")
+            claim = self.claim(stage, key)
+            if not claim.take():
+                return False
+            try:
+                if path not in [found for found, _ in self.garbage(days, key)]:
+                    return False
+                path = self.trash(path)
+            finally:
+                claim.release()
+
+        def failed(function: Any, name: str, error: Any) -> None:
+            if not issubclass(error[0], FileNotFoundError):  # another gc is faster
+                raise error[1]
+
+        shutil.rmtree(path, onerror=failed)
+        return True
+
+    def _node(self, folder: Path) -> _Node | None:
+        """What gc must know of an artifact; None where it is gone. Read once: gc looks again before each removal.
+
+        One with a damaged manifest counts as in use: while its inputs are there, it can be repaired.
+        """
+        try:
+            stat = (folder / "manifest.json").stat()
+            stamp = stat.st_ino, stat.st_mtime_ns, stat.st_size
+        except OSError:
+            stamp = None
+        known = self._nodes.get(folder)
+        if known is None or stamp is None or known[0] != stamp:
+            try:
+                about = Artifact(folder).manifest
+            except Damaged:
+                if not folder.exists():
+                    return None
+                about = read_draft(folder) or {"key": folder.name, "preimage": {"inputs": {}}}
+            made, inputs = about.get("finished"), tuple(about["preimage"]["inputs"].values())
+            known = stamp, _Node(folder, about["key"], made or 0.0, inputs, damaged=made is None)
+            self._nodes[folder] = known
+        return known[1]
+
+
+class _Node(NamedTuple):
+    """An artifact as gc sees it."""
+
+    path: Path
+    key: str
+    made: float
+    inputs: tuple[str, ...]  # their keys
+    damaged: bool  # its manifest is
+
+
+def _changed_since(draft: Path, moment: float) -> bool:
+    """Whether anything was written in the draft since then: a part's marker, a log, a checkpoint, a file, the run's state."""
+    for folder in ("running", "state", "markers", "logs", "files"):
+        for where, _, names in os.walk(draft / folder):
+            for name in ("", *names):
+                with contextlib.suppress(FileNotFoundError):
+                    if os.stat(os.path.join(where, name)).st_mtime >= moment:
+                        return True
+    return False
+
+
+def store_of(artifact: Artifact) -> Store:
+    """The store that the artifact lies in."""
+    return Store(artifact.path.absolute().parents[1])
+
+
+def iter_inputs(store: Store, artifact: Artifact) -> Iterator[tuple[str, str, Artifact | None]]:
+    """(input name, key, artifact or None if it is gone) of each input."""
+    for name, key in artifact.manifest["preimage"]["inputs"].items():
+        yield name, key, store.find(name, key)
+
+
+def history(inputs: Mapping[str, Artifact]) -> dict[str, dict[str, Any]]:
+    """Stage -> preimage of its key, for ``inputs`` and everything upstream of them that is still in the store."""
+    found: dict[str, dict[str, Any]] = {}
+    todo = list(inputs.values())
+    while todo:
+        artifact = todo.pop()
+        if artifact.stage not in found:
+            found[artifact.stage] = artifact.manifest["preimage"]
+            todo += [parent for _, _, parent in iter_inputs(store_of(artifact), artifact) if parent is not None]
+    return found

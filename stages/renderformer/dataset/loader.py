@@ -1,0 +1,328 @@
+"""The order of samples, and what hands batches out: on any number of ranks and workers, resumable to the next batch.
+
+Reads a ``ShardDataset``, writes nothing. One design choice: a batch is a pure function of (dataset, config, step). Order comes
+from seed and epoch, augmentation from seed, epoch and sample id; a rank takes its slice of the global batch; workers only
+decide who computes a step. So to resume is to remember one number.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from pipeline.config import Section
+from pipeline.errors import UserError
+from pipeline.keys import seed_for
+from stages.renderformer.dataset.augment import (
+    Batch,
+    Relight,
+    collate,
+    draw_light_factors,
+    expose,
+    make_example,
+    mirror,
+    move,
+    rotation_from_vector,
+)
+from stages.renderformer.dataset.shards import DamagedSample, ShardDataset
+from stages.renderformer.views import LAYERS
+
+MOST_DAMAGED = 64  # samples in a row that cannot be read before it is the dataset that is damaged
+
+
+class BatchConfig(Section):
+    """What a training batch holds."""
+
+    seed: int = 0
+    batch_scenes: int = Field(4, ge=1)  # over all ranks
+    views_per_scene: int = Field(2, ge=0)  # 0: no images
+    rotate: bool = True  # rotation vector ~ N(0, I)
+    translate_sigma: float = Field(0.25, ge=0)  # scene units, translation ~ N(0, sigma^2 I)
+    mirror: bool = False  # x -> -x, for half of the samples
+    exposure_stops: float = Field(0.0, ge=0)  # radiance, seen and emitted, times 2^U(-stops, stops)
+    relight: bool = False
+    lighting: Relight = Relight()  # what relight draws from
+    layers: tuple[str, ...] = ()  # AOV layers that a batch holds besides the image; only then are they read
+    shuffle_shards: int = Field(0, ge=0)  # scenes are shuffled over this many shards at a time; 0: over the whole split
+    bucket: int = Field(0, ge=0)  # global batches whose scenes are sorted by triangle count together; 0: none
+    pad_multiple: int = Field(1, ge=1)  # the padded number of triangles is a multiple of it: few shapes for compilers
+
+    @field_validator("layers")
+    @classmethod
+    def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if unknown := set(names) - LAYERS.keys():
+            raise ValueError(f"layers {', '.join(sorted(unknown))} are unknown: choose from {', '.join(LAYERS)}")
+        return names
+
+
+class Batches:
+    """``batches(step)``: the batch of a step. Rank r of ``world`` gets its slice of the same global batch."""
+
+    def __init__(self, dataset: ShardDataset, config: BatchConfig, rank: int = 0, world: int = 1):
+        if config.batch_scenes % world:
+            raise UserError(
+                f"batch_scenes={config.batch_scenes} cannot be shared by {world} processes: make it a multiple of {world}"
+            )
+        self.dataset, self.config, self.rank, self.world = dataset, config, rank, world
+        self._orders: dict[int, np.ndarray] = {}
+        self._lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_orders": {}, "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._lock = threading.Lock()
+
+    def __call__(self, step: int) -> Batch:
+        share = self.config.batch_scenes // self.world
+        first = step * self.config.batch_scenes + self.rank * share
+        damaged: dict[str, str] = {}
+        examples = (self._example(position, damaged) for position in range(first, first + share))
+        return collate(examples, share, self.config.pad_multiple) | {"damaged": sorted(damaged.items())}
+
+    def order(self, epoch: int) -> np.ndarray:
+        """(len(dataset),) indices in the order of that epoch: each exactly once.
+
+        With ``shuffle_shards`` the shards are shuffled and their scenes mixed only within windows of that many of them, so that
+        few shards are in use at a time: for disks that hate seeks, and splits that are fetched and do not fit.
+
+        With buckets, scenes are shuffled first and sorted only inside pools of ``bucket`` global batches, and a pool's batches
+        are shuffled again: what a batch holds changes with every epoch, its mean size carries no order.
+        """
+        with self._lock:
+            if epoch not in self._orders:
+                self._orders = {**dict(list(self._orders.items())[-3:]), epoch: self._draw_order(epoch)}
+            return self._orders[epoch]
+
+    def _draw_order(self, epoch: int) -> np.ndarray:
+        config, counts, shards = self.config, self.dataset.triangles, self.dataset.shard_of
+        rng = np.random.default_rng(seed_for(config.seed, "epoch", str(epoch)))
+        order = rng.permutation(len(counts))
+        if config.shuffle_shards:  # by windows of shards; stable, so that scenes stay shuffled within a window
+            window = np.argsort(rng.permutation(shards.max() + 1)) // config.shuffle_shards
+            order = order[np.argsort(window[shards[order]], kind="stable")]
+        if config.bucket:
+            batch = config.batch_scenes
+            start = -epoch * len(counts) % batch  # the last batch of the epoch before takes its rest from this one's head
+            for first in range(start, len(order), config.bucket * batch):
+                pool = order[first : first + config.bucket * batch]
+                pool = pool[np.argsort(counts[pool], kind="stable")]
+                whole = len(pool) // batch * batch
+                shuffled = rng.permutation(pool[:whole].reshape(-1, batch), axis=0).reshape(-1)
+                order[first : first + len(pool)] = np.concatenate([shuffled, pool[whole:]])
+        return order
+
+    def padding_waste(self, first_step: int, steps: int) -> float:
+        """Share of padded triangles in those global batches, all ranks together, from the index alone."""
+        scenes, share = self.config.batch_scenes, self.config.batch_scenes // self.world
+        positions = range(first_step * scenes, (first_step + steps) * scenes)
+        counts = np.array([self.dataset.triangles[self._index(position)[1]] for position in positions]).reshape(-1, share)
+        multiple = self.config.pad_multiple
+        longest = -(-counts.max(axis=1) // multiple) * multiple
+        return float(1 - counts.sum() / (longest * share).sum())
+
+    def sequence(self) -> str:
+        """Hex digest of all that decides which batch follows which: not of rank, world or workers."""
+        told = json.dumps([self.config.model_dump(mode="json"), self.dataset.split, self.dataset.ids])
+        return hashlib.blake2b(told.encode() + self.dataset.triangles.tobytes(), digest_size=16).hexdigest()
+
+    def _index(self, position: int) -> tuple[int, int]:
+        """Epoch and dataset index at that position of the endless sequence of epochs."""
+        epoch, place = divmod(position, len(self.dataset))
+        return epoch, int(self.order(epoch)[place])
+
+    def _example(self, position: int, damaged: dict[str, str]) -> Batch:
+        """The example at that position; in the place of a damaged sample, the next in the epoch's order that is not."""
+        epoch, place = divmod(position, len(self.dataset))
+        order = self.order(epoch)
+        for ahead in range(min(len(order), MOST_DAMAGED)):
+            index = int(order[(place + ahead) % len(order)])
+            try:
+                return self._augmented(index, epoch)
+            except DamagedSample as error:
+                damaged[self.dataset.ids[index]] = str(error)
+        raise UserError(f"{len(damaged)} samples in a row cannot be read, the last because {list(damaged.values())[-1]}")
+
+    def _augmented(self, index: int, epoch: int) -> Batch:
+        config, row = self.config, self.dataset.row(index)
+        rng = np.random.default_rng(seed_for(config.seed, "augment", f"{epoch}/{row['id']}"))
+        kept, wanted = np.array(row["views"]), config.views_per_scene
+        views = rng.choice(kept, size=wanted, replace=wanted > len(kept))
+        sample = self.dataset.read(index, views, config.layers, None)
+        factors = draw_light_factors(config.lighting, rng, sample.scene.n_lights) if config.relight else None
+        example = make_example(sample, views, factors, config.layers)
+        if config.mirror and rng.random() < 0.5:
+            example = mirror(example)
+        if config.rotate or config.translate_sigma:
+            vector = rng.normal(size=3) if config.rotate else np.zeros(3)
+            example = move(example, rotation_from_vector(vector), rng.normal(size=3) * config.translate_sigma)
+        if config.exposure_stops:
+            example = expose(example, 2.0 ** rng.uniform(-config.exposure_stops, config.exposure_stops))
+        return example
+
+
+def evaluation_samples(dataset: ShardDataset) -> Iterator[Batch]:
+    """One scene at a time with all its kept views, exactly as stored, and the direct light beside it."""
+    for index in range(len(dataset)):
+        sample = dataset.read(index, layers=("direct",))
+        yield collate([make_example(sample, np.array(sorted(sample.views)), None, ("direct",))], 1)
+
+
+# --- workers ----------------------------------------------------------------------------------------------------------
+
+
+def prefetch(
+    batches: Callable[[int], Batch], start: int, stop: int | None, ahead: int = 2, workers: int = 0
+) -> Iterator[Batch]:
+    """The batches of steps ``start`` .. ``stop`` - 1 (None: without end) in order, prepared up to ``ahead`` steps early.
+
+    By threads of this process, which is enough for few cores (OpenEXR, zlib and numpy release Python's lock while they work),
+    or by ``workers`` processes, which also share what is left of Python (docs/dataset.md has the figures).
+    """
+    return _by_processes(batches, start, stop, ahead, workers) if workers else _by_threads(batches, start, stop, ahead)
+
+
+def _steps(start: int, stop: int | None) -> Iterator[int]:
+    step = start
+    while stop is None or step < stop:
+        yield step
+        step += 1
+
+
+def _by_threads(batches: Callable[[int], Batch], start: int, stop: int | None, ahead: int) -> Iterator[Batch]:
+    pool = ThreadPoolExecutor(max_workers=max(1, ahead), thread_name_prefix="prefetch")
+    try:
+        waiting: deque = deque()
+        for step in _steps(start, stop):
+            waiting.append(pool.submit(batches, step))
+            if len(waiting) > ahead:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+class _Steps:
+    """``batches`` as a map-style dataset over steps, for torch's DataLoader; arrays travel as tensors, in shared memory."""
+
+    def __init__(self, batches: Callable[[int], Batch]):
+        self.batches = batches
+
+    def __getitem__(self, step: int) -> tuple[Batch, str | None]:
+        import torch
+
+        try:
+            batch = self.batches(step)
+        except UserError as error:  # DataLoader would bury it in the worker's traceback
+            return {}, str(error)
+        arrays = {name: torch.from_numpy(value) for name, value in batch.items() if isinstance(value, np.ndarray)}
+        return {**batch, **arrays}, None
+
+
+class _Sampler:
+    def __init__(self, start: int, stop: int | None):
+        self.start, self.stop = start, stop
+
+    def __iter__(self) -> Iterator[int]:
+        return _steps(self.start, self.stop)
+
+
+def _by_processes(batches: Callable[[int], Batch], start: int, stop: int | None, ahead: int, workers: int) -> Iterator[Batch]:
+    import torch
+    from torch.utils.data import DataLoader
+
+    dataset = getattr(batches, "dataset", None)
+    whole = getattr(dataset, "cache_bytes", 0)
+    if dataset is not None:
+        dataset.cache_bytes = whole // workers  # every process has its own
+    try:
+        rows = iter(
+            DataLoader(
+                _Steps(batches),  # type: ignore[arg-type]
+                batch_size=None,
+                collate_fn=_as_it_is,
+                sampler=_Sampler(start, stop),  # type: ignore[arg-type]
+                num_workers=workers,
+                prefetch_factor=max(1, -(-ahead // workers)),
+                worker_init_fn=_one_thread,
+            )
+        )
+    finally:
+        if dataset is not None:
+            dataset.cache_bytes = whole
+    for batch, error in rows:
+        if error is not None:
+            raise UserError(error)
+        yield {name: value.numpy() if isinstance(value, torch.Tensor) else value for name, value in batch.items()}
+
+
+def _as_it_is(batch: Any) -> Any:
+    return batch
+
+
+def _one_thread(worker: int) -> None:
+    import torch
+
+    torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"
+
+
+class Loader:
+    """Batches one after the other, and where it stands.
+
+    ``workers`` as in ``prefetch``; neither they nor ``ahead`` nor the ranks change what comes out. ``damaged`` maps ids of
+    samples that could not be read to the reason; each is logged once.
+    """
+
+    def __init__(
+        self,
+        batches: Batches,
+        *,
+        stop: int | None = None,
+        workers: int = 0,
+        ahead: int = 4,
+        log: Callable[[str], None] = print,
+    ):
+        self.batches, self.stop, self.workers, self.ahead, self.log = batches, stop, workers, ahead, log
+        self.step = 0  # of the next batch
+        self.damaged: dict[str, str] = {}
+        self._triangles = self._slots = 0
+
+    def __iter__(self) -> Iterator[Batch]:
+        for batch in prefetch(self.batches, self.step, self.stop, self.ahead, self.workers):
+            for id, reason in batch["damaged"]:
+                if id not in self.damaged:
+                    self.damaged[id] = reason
+                    self.log(f"sample {id} is skipped: {reason}")
+            self._triangles += int(batch["mask"].sum())
+            self._slots += batch["mask"].size
+            self.step += 1
+            yield batch
+
+    @property
+    def padded(self) -> float:
+        """Share of the triangles handed out so far that were padding."""
+        return 1 - self._triangles / self._slots if self._slots else 0.0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where to go on: after the batches that were handed out, whatever was read ahead."""
+        return {"step": self.step, "sequence": self.batches.sequence()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        if state["sequence"] != self.batches.sequence():
+            raise UserError(
+                "the loader's state belongs to another sequence of batches: dataset, split, seed, batch_scenes and "
+                "augmentation must be those of the run that saved it"
+            )
+        self.step = int(state["step"])

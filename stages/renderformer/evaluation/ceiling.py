@@ -1,0 +1,75 @@
+"""The ceiling: what a model would score that predicted the noiseless truth.
+
+The targets are path traced and denoised, so they differ from the noiseless truth by an error of their own, and a perfect model
+is charged for it. Two things are known of that error, both noted by *render* in a view's meta:
+
+- Some views were rendered twice, independently. Half the mean squared difference of such a pair is the mean squared error
+  that noise leaves in one image, so ``PSNR(A, B) + 3.01 dB`` is the PSNR of the noiseless truth against one of them
+  (``stages.renderformer.rendering.noise``). The ceiling in dB is the mean of that over the pairs, as the model's PSNR is a
+  mean over views. It lacks what both renders share (the denoiser's bias): the real ceiling is at most this high.
+- Every view has an estimate of its mean absolute error of log10(1 + x), the denoiser's bias included
+  (``stages.renderformer.rendering.error``). Its mean over the evaluated views is the least log error that can be expected.
+
+Other metrics have none: no formula leads from a pair's score to that of the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from stages.graphics.metrics import METRICS
+from stages.graphics.statistics import Scene, bootstrap
+
+if TYPE_CHECKING:
+    from pipeline.store import Artifact
+
+ENOUGH = 20  # pairs of the evaluated split; where it has fewer, all splits are asked: their noise has the same law
+MOST = 20000  # scenes whose meta is read for them
+
+
+def view_noise(meta: Mapping[str, Any], camera: int) -> dict[str, Any]:
+    """What is known of the noise in one view, from its sample's meta.
+
+    ``log_error``: estimated, or None; ``pair``: the error of one image of a pair, ``{"log_error", "psnr"}``, or None.
+    """
+    noted = next(view for view in meta["render"]["views"] if view["index"] == camera)
+    return {"log_error": noted["error"], "pair": noted["noise"]["sum"] if "noise" in noted else None}
+
+
+def noise_pairs(shard: Artifact, split: str) -> tuple[list[list[dict[str, float]]], str]:
+    """Per scene that has some, the errors told by its pairs; and the split that they are of, or "all splits"."""
+    from stages.graphics.arrays import unpack_json
+
+    def of(ids: list[str]) -> list[list[dict[str, float]]]:
+        found = []
+        for id in ids[:: len(ids) // MOST + 1]:
+            meta = unpack_json(shard.read(id, ("meta.json",)).members["meta.json"])
+            pairs = [view_noise(meta, camera)["pair"] for camera in meta["views"]]
+            found.append([pair for pair in pairs if pair is not None])
+        return [pairs for pairs in found if pairs]
+
+    own = of(shard.ids(split))
+    return (own, split) if sum(map(len, own)) >= ENOUGH else (of(shard.ids()), "all splits")
+
+
+def ceiling(scenes: Sequence[Scene], split: str, pairs: Sequence[Sequence[Mapping[str, float]]], where: str) -> dict[str, Any]:
+    """Metric -> its ceiling ``{"mean", "low", "high", "views", "scenes", "of", "from"}``; metrics without one are left out.
+
+    scenes: those evaluated, of ``split``. pairs, where: see `noise_pairs`.
+    """
+    told = {}
+
+    def tell(metric: str, values: Sequence[Sequence[float]], of: str, source: str) -> None:
+        if values:
+            counts = {"views": sum(map(len, values)), "scenes": len(values)}
+            told[metric] = {**bootstrap(values, METRICS[metric].bounds), **counts, "of": of, "from": source}
+
+    estimates = [[view["noise"]["log_error"] for view in scene["views"]] for scene in scenes]
+    estimates = [known for scene in estimates if (known := [value for value in scene if value is not None])]
+    tell("psnr", [[pair["psnr"] for pair in scene] for scene in pairs], where, "pairs")
+    if estimates:
+        tell("log_error", estimates, split, "estimates")
+    else:
+        tell("log_error", [[pair["log_error"] for pair in scene] for scene in pairs], where, "pairs")
+    return told

@@ -1,0 +1,210 @@
+"""Runs in numbers and in words: the columns of the summary, verdicts, differences; as Markdown to paste and as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from stages.graphics.metrics import METRICS, Metric, named
+from stages.graphics.statistics import BARS, JUDGED, METHODS, Estimate, decided, difference, with_interval
+from stages.renderformer.evaluation.runs import Probe, Run
+
+CEILING = "ceiling: noise of the ground truth"
+
+
+def told(metric: Metric, value: Estimate, sign: str = "") -> tuple[str, str]:
+    """Mean and its interval (``low to high``, "none: too few scenes"), as text."""
+    if value["low"] is None:
+        return metric.format(value["mean"], sign), "none: too few scenes"
+    mean, low, high = (metric.format(value[key], sign) for key in ("mean", "low", "high"))
+    return mean, f"{low} to {high}"
+
+
+def metrics_of(summaries: Collection[Mapping[str, Any]]) -> dict[str, Metric]:
+    """Every metric that one of the runs has."""
+    return named({name for summary in summaries for name in summary["methods"]["model"]})
+
+
+def verdicts(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """One sentence for each bar and judged metric, true or not; ``decided``: the interval leaves no doubt which."""
+    out = []
+    for bar in BARS:
+        for name in JUDGED:
+            gain, metric = summary["gains"][bar][name], METRICS[name]
+            mean, interval = told(metric, gain, "+")
+            won = gain["mean"] > 0
+            text = f"{'beats' if won else 'does not beat'} the {METHODS[bar]} in {metric.label}: gain "
+            text += f"{mean} {metric.unit}".rstrip() + f" (95 % interval {interval})"
+            out.append({"won": won, "decided": decided(gain), "text": text})
+    return out
+
+
+def ceiling_lines(summary: Mapping[str, Any]) -> list[str]:
+    """What the noise of the ground truth means for the scores, one sentence per metric that has a ceiling."""
+    lines = []
+    for name, ceiling in summary["ceiling"].items():
+        metric, (mean, interval) = METRICS[name], told(METRICS[name], ceiling)
+        text = f"{metric.label}: the noiseless truth would score " + f"{mean} {metric.unit}".rstrip()
+        source = {"pairs": "rendered twice", "estimates": "by the renderer's own estimate"}[ceiling["from"]]
+        text += f" (95 % interval {interval}; {ceiling['views']} views of {ceiling['of']}, {source})"
+        lines.append(text + ".")
+    return lines or ["No view of the data was rendered twice and none has an error estimate: the ceiling is unknown."]
+
+
+def noise_share(summary: Mapping[str, Any]) -> float | None:
+    """The noise's share of the model's squared error, told from mean PSNR and its ceiling; None where that is unknown."""
+    if "psnr" not in summary["ceiling"]:
+        return None
+    return 10 ** ((summary["methods"]["model"]["psnr"]["mean"] - summary["ceiling"]["psnr"]["mean"]) / 10)
+
+
+def columns(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Columns of the summary, ``{"label", "kind", "values": {metric: bootstrap}}``: the runs, then what they are seen against.
+
+    A baseline that is the same for several runs, as it is on the same data, has one column.
+    """
+    single = len(runs) == 1
+    out = [
+        {"label": METHODS["model"] if single else run.name, "kind": "model", "values": run.summary["methods"]["model"]}
+        for run in runs
+    ]
+    for method, label in [*METHODS.items(), ("ceiling", CEILING)]:
+        if method == "model":
+            continue
+        found: list[tuple[dict[str, Any], list[str]]] = []
+        for run in runs:
+            values = run.summary["ceiling"] if method == "ceiling" else run.summary["methods"][method]
+            for other, names in found:
+                if all(other.get(name, value) == value for name, value in values.items()):
+                    other |= values
+                    names.append(run.name)
+                    break
+            else:
+                found.append((dict(values), [run.name]))
+        kind = "bar" if method in BARS else method
+        for values, names in found:
+            of = "" if len(found) == 1 else f", {', '.join(names)}"
+            out.append({"label": label + of, "kind": kind, "values": values})
+    return out
+
+
+def best_of(columns: Sequence[Mapping[str, Any]], metrics: Mapping[str, Metric]) -> dict[str, int]:
+    """Per metric the column of the best mean among models and bars."""
+    best = {}
+    for name, metric in metrics.items():
+        known = [i for i, column in enumerate(columns) if column["kind"] in ("model", "bar") and name in column["values"]]
+        best[name] = (max if metric.higher_is_better else min)(
+            known, key=lambda i, name=name: columns[i]["values"][name]["mean"]
+        )
+    return best
+
+
+def same_scenes(runs: Sequence[Run]) -> set[str]:
+    """Ids of the scenes whose data is the same in all runs."""
+    return {id for id, target in runs[0].targets.items() if all(run.targets.get(id) == target for run in runs)}
+
+
+def all_same(runs: Sequence[Run]) -> bool:
+    """Whether all runs were evaluated on the same scenes, and on no others."""
+    return all(run.targets == runs[0].targets for run in runs)
+
+
+def differences(runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
+    """Name -> how much better that run is than the first (`statistics.difference`), over the scenes that all have in common."""
+    same = same_scenes(runs)
+    found = {}
+    for run in runs[1:]:
+        scenes = [other.summary["per_scene"] for other in (run, runs[0])]
+        metrics = {
+            name: metric
+            for name, metric in metrics_of([run.summary, runs[0].summary]).items()
+            if all(name in other.summary["methods"]["model"] for other in (run, runs[0]))
+        }
+        found[run.name] = difference(*scenes, same, metrics)
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def unlike(runs: Sequence[Run]) -> dict[str, list[str]]:
+    """Settings in which the runs differ: ``stage.name`` -> a value per run."""
+    flat = [dict(flatten(run.configs)) for run in runs]
+    names = dict.fromkeys(name for one in flat for name in one)
+    rows = {name: [one.get(name, "–") for one in flat] for name in names}
+    return {name: values for name, values in rows.items() if len(set(values)) > 1}
+
+
+def markdown(summary: Mapping[str, Any]) -> str:
+    """The summary of one run as a Markdown table to paste; the best of model and bars in bold."""
+    metrics = metrics_of([summary])
+    rows = columns([Run("model", "", summary)])
+    best = best_of(rows, metrics)
+    lines = [
+        f"{summary['scenes']} scenes, {summary['views']} views; mean over views [95 % interval over scenes]",
+        "",
+        "| method | " + " | ".join(metric.heading for metric in metrics.values()) + " |",
+        "| --- |" + " ---: |" * len(metrics),
+    ]
+    for number, row in enumerate(rows):
+        if row["values"]:
+            cells = [_cell(metric, row["values"].get(name), best[name] == number) for name, metric in metrics.items()]
+            lines.append(f"| {row['label']} | " + " | ".join(cells) + " |")
+    lines += ["", *(f"- The model {verdict['text']}." for verdict in verdicts(summary))]
+    lines += [f"- Ceiling in {line}" for line in ceiling_lines(summary)] if summary["ceiling"] else []
+    return "\n".join(lines) + "\n"
+
+
+def _cell(metric: Metric, value: Estimate | None, bold: bool, sign: str = "") -> str:
+    if value is None:
+        return "–"
+    return with_interval(value, lambda number: metric.format(number, sign), bold)
+
+
+def _plain(cell: Any) -> str:
+    """A value of a probe's table as a Markdown cell."""
+    return "–" if cell is None else str(cell).replace("|", "\\|")
+
+
+def side_by_side(runs: Sequence[Run], probes: Sequence[Probe]) -> str:
+    """Several runs as Markdown tables to paste: runs as columns, differences, probes."""
+    lines = []
+    if runs:
+        metrics = metrics_of([run.summary for run in runs])
+        table = [column for column in columns(runs) if column["values"]]
+        best = best_of(table, metrics) if all_same(runs) else dict.fromkeys(metrics)
+        lines = ["Mean over views [95 % interval over scenes]", ""]
+        lines += ["| metric | " + " | ".join(column["label"] for column in table) + " |", "| --- |" + " ---: |" * len(table)]
+        for name, metric in metrics.items():
+            cells = [_cell(metric, column["values"].get(name), best[name] == i) for i, column in enumerate(table)]
+            lines.append(f"| {metric.heading} | " + " | ".join(cells) + " |")
+        found = differences(runs)
+        if found:
+            first = next(iter(found.values()))
+            paired = f"paired over {first['views']} views of {first['scenes']} scenes"
+            lines += ["", f"How much better than {runs[0].name}, {paired} (positive is better)", ""]
+            lines += ["| metric | " + " | ".join(found) + " |", "| --- |" + " ---: |" * len(found)]
+            for name, metric in metrics.items():
+                cells = [_cell(metric, row["gains"].get(name), False, "+") for row in found.values()]
+                lines.append(f"| {metric.label}{f' ({metric.unit})' if metric.unit else ''} | " + " | ".join(cells) + " |")
+    for probe in probes:
+        facts = probe.facts
+        lines += ["", f"### {facts['title']}", "", facts["question"], ""]
+        lines += ["| " + " | ".join(facts["columns"]) + " |", "| --- |" + " ---: |" * (len(facts["columns"]) - 1)]
+        lines += ["| " + " | ".join(_plain(cell) for cell in row) + " |" for row in facts["rows"]]
+        lines += ["", *(f"- {note}" for note in facts["notes"])] if facts["notes"] else []
+    return "\n".join(lines).strip() + "\n"
+
+
+def numbers(runs: Sequence[Run], probes: Sequence[Probe]) -> dict[str, Any]:
+    """What the page says, as plain JSON; the scores of every view are in each run's own metrics.json."""
+    shown = [
+        {"name": run.name, "key": run.key, **{k: v for k, v in run.summary.items() if k != "per_scene"}, "timing": run.timing}
+        for run in runs
+    ]
+    against = {"base": runs[0].name, "runs": differences(runs)} if len(runs) > 1 else None
+    return {"runs": shown, "differences": against, "probes": [{"key": probe.key, **probe.facts} for probe in probes]}
+
+
+def flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:
+    """Nested config as (dotted name, value) lines."""
+    if isinstance(value, Mapping):
+        return [line for key in value for line in flatten(value[key], f"{prefix}{key}.")]
+    return [(prefix.rstrip("."), "none" if value is None else str(value))]

@@ -1,0 +1,77 @@
+"""Scenes to images by a trained network: what *evaluate* and ``stages.renderformer.inference.renderer`` share.
+
+Reads a released-format checkpoint folder and scene records; gives linear HDR images. One design choice: a scene is encoded once
+and its views are decoded from the same tokens a few at a time (section 3.1), so that memory does not grow with their number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stages.renderformer.inference.limits import light_radiance
+
+if TYPE_CHECKING:
+    from model.renderformer.network import RenderFormer
+    from stages.renderformer.records import SceneRecord
+
+
+def load_model(folder: Path) -> RenderFormer:
+    """The network of a released-format checkpoint folder, in eval mode on the CPU."""
+    from model.renderformer import checkpoint
+
+    return checkpoint.load(folder)[0]
+
+
+def predict_frames(
+    model: RenderFormer, scene: SceneRecord, views: Sequence[int], resolution: int | tuple[int, int], device: Any = "cpu"
+) -> Iterator[np.ndarray]:
+    """(H, W, 3) float32 linear radiance of the scene's cameras ``views``, at least 0, one after the other."""
+    import torch
+
+    from model.renderformer.network import to_radiance
+
+    arrays = scene.arrays()
+    patches = arrays.pop("patches", None)
+    batch = {name: array[None] for name, array in arrays.items()} | {"mask": np.ones((1, len(scene.triangles)), bool)}
+    if patches is not None:
+        batch["patches"] = patches
+    model = model.to(device).eval()
+    cameras = torch.from_numpy(scene.camera_to_world[list(views)].astype(np.float32)).to(device)[None]
+    fov = torch.from_numpy(scene.fov_deg[list(views)].astype(np.float32)).to(device)[None]
+    for y in model.render_batches(model.read(batch, device), cameras, fov, resolution):
+        yield from to_radiance(y[0]).clamp(min=0).cpu().numpy()  # the network may undershoot 0 by a thousandth
+
+
+def predict_scene(
+    model: RenderFormer, scene: SceneRecord, views: Sequence[int], resolution: int, device: Any = "cpu"
+) -> np.ndarray:
+    """(V, H, W, 3): all of ``predict_frames``."""
+    return np.stack(list(predict_frames(model, scene, views, resolution, device)))
+
+
+def single_lights(scene: SceneRecord) -> Iterator[SceneRecord]:
+    """The scene under each of its lights alone; the others stay as what an unlit light is, a surface that reflects nothing."""
+    for light in range(scene.n_lights):
+        off = (scene.light_index >= 0) & (scene.light_index != light)
+        dark = {
+            name: np.where(off[:, None], np.float32(0), getattr(scene, name)) for name in ("diffuse", "specular", "emission")
+        }
+        yield replace(scene, **dark)
+
+
+def light_passes(scene: SceneRecord) -> Iterator[tuple[SceneRecord, float]]:
+    """For each light the scene under it alone, made as bright as all lights together, and its share of that.
+
+    The image is the sum over passes of share times prediction. Without the exposure, which light transport takes back exactly,
+    each pass of many would be darker than anything that a network was trained with (docs/probes.md, probe=lights).
+    """
+    radiance = light_radiance(scene)
+    shares = radiance / radiance.sum()
+    for alone, share in zip(single_lights(scene), shares, strict=True):
+        if share > 0:
+            yield replace(alone, emission=(alone.emission / share).astype(np.float32)), float(share)

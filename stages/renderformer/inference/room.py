@@ -1,0 +1,248 @@
+"""A mesh file as a scene: the default room, lights and camera around one object.
+
+Reads a mesh file (``stages.graphics.geometry.load``); returns a ``SceneRecord``. The room is one of the templates that the
+training scenes are drawn from, with every number inside the released ranges (paper section 3.3), so that a model sees what it
+knows: the object stands on the floor, its front to the camera, under three white lights. Design choice: an object of more
+triangles than there is room for goes through *remesh* and *decimate* themselves, with their defaults, and so becomes an
+object like those of the training data; one of few large triangles is subdivided as far as there is room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import Reject, UserError
+from stages.graphics.geometry.records import MeshRecord, TextureRecord
+from stages.renderformer.records import SceneRecord
+from stages.renderformer.scenes import laws, meshes
+from stages.renderformer.scenes.assemble import WALL_FACES, assemble, camera_to_world, normalize, place
+from stages.renderformer.scenes.laws import TEMPLATES, Camera, Light, Material, MaterialLaw, Placement, Plan
+
+MAX_BYTES, MAX_FACES = 1 << 28, 2_000_000  # of a mesh file, as *collect* has them
+LEAST_FACES = 128  # an object should get; a room with fewer walls is taken before
+UP = {"x": (0, 90, 0), "-x": (0, -90, 0), "y": (90, 0, 0), "-y": (-90, 0, 0), "z": (0, 0, 0), "-z": (180, 0, 0)}
+Z_UP = (".stl",)  # made for printing; the other formats mostly have y up, as glTF prescribes
+
+# Half of a quad of the largest wall, scene units squared: larger triangles are rare in the training data (paper, figure 9)
+LARGEST_TRIANGLE = (laws.WallLaw().scale[1] / 8) ** 2 / 2
+
+# Scene units. The object's bounding sphere stands on the floor in the middle.
+RADIUS = 0.4
+FLOOR = 0.6, 0.57, 0.53
+WALL_COLOURS = {"right": (0.55, 0.2, 0.13), "back": FLOOR, "left": (0.16, 0.34, 0.4)}
+OBJECT_COLOUR = 0.7, 0.7, 0.7  # of files without base colours
+SPECULAR, ROUGHNESS = 0.1, 0.4  # of the object
+CAMERAS = {"box": (-0.15, -1.0, 0.35)}  # direction from what they look at; of the other templates:
+CAMERA = -0.55, -1.0, 0.65
+CAMERA_DISTANCE = 1.85
+FILLED = 0.66  # of the picture's side, by the object
+LIGHTS = {(-0.9, -0.5, 1.0): 0.5, (0.55, -1.0, 0.9): 0.2, (-0.2, -0.1, 1.2): 0.3}  # direction from the centre -> share
+LEAST_TRIANGLES = WALL_FACES + len(LIGHTS) + LEAST_FACES // 2  # a floor, the lights and something on it
+LIGHT_RADIANCE, LIGHT_SCALE, LIGHT_DISTANCE = 2500.0, 2.0, 2.6
+
+
+@dataclass(frozen=True)
+class Room:
+    """What may be chosen. template: floor, wall, corner or box; None: a corner, or with fewer walls where triangles are
+    short. up: which of the file's axes points up, ``x`` to ``-z``; None: z for STL, y for the other formats."""
+
+    template: str | None = None
+    up: str | None = None
+
+
+def room_scene(path: Path, triangles: int | None = None, room: Room | None = None) -> SceneRecord:
+    """The mesh file in its room, at most ``triangles`` triangles in all (None: the mesh as it is).
+
+    ``meta["notes"]`` says what was done to the mesh. UserError: the file has no mesh that can be used.
+    """
+    import trimesh
+
+    from stages.graphics.geometry.load import load_mesh, normalise
+
+    room = room or Room()
+    if room.template not in (None, *TEMPLATES) or room.up not in (None, *UP):
+        raise UserError(
+            f"room {room.template!r}, up {room.up!r}: expected one of {', '.join(TEMPLATES)}, and one of {', '.join(UP)}"
+        )
+    if triangles is not None and triangles < LEAST_TRIANGLES:
+        raise UserError(f"a room of {triangles} triangles: an object on a floor needs at least {LEAST_TRIANGLES}")
+    path = path.resolve()  # a link may point anywhere: what the file refers to must lie beside what it points to
+    try:
+        loaded = load_mesh(path, path.parent, MAX_BYTES, MAX_FACES, textures=True)
+    except Reject as error:
+        from stages.renderformer.s00_collect import Collect
+
+        raise UserError(f"{path} cannot be used: {Collect.reasons[error.reason]} ({error.detail})") from None
+    original = normalise(loaded.vertices).astype(np.float64), loaded.faces
+    template = room.template or _template(triangles, len(loaded.faces))
+    walls = TEMPLATES[template]
+    spare = None if triangles is None else max(triangles - WALL_FACES * len(walls) - len(LIGHTS), LEAST_FACES // 2)
+    notes = [f"{path.name}: {note}" for note in loaded.notes]
+    mesh = _welded(*original)
+    if spare is not None and len(mesh[1]) > spare:
+        mesh, how = decimated(*original, spare)
+        notes.append(f"{path.name}: {len(original[1]):,} triangles {how} to {len(mesh[1]):,}, of {triangles:,} in the scene")
+
+    turn = UP[room.up or ("z" if path.suffix.lower() in Z_UP else "y")]
+    placement = _object(mesh[0], turn)
+    while spare is not None and 4 * len(mesh[1]) <= spare and _largest(mesh, placement) > LARGEST_TRIANGLE:
+        mesh = trimesh.remesh.subdivide(*mesh)
+        placement = _object(mesh[0], turn)  # another mean of the vertices
+    camera = _camera(template, place(normalize(mesh[0]), placement))
+    plan = Plan(template, "single", False, [_wall(name) for name in walls], [placement], _lights(), [camera])
+    meta = {"law": "room", "source": path.name, "notes": notes}
+    scene = assemble(path.stem, plan, [mesh], [{"faces_before": len(original[1])}], MaterialLaw(), meta)
+    if loaded.texture is None:
+        return scene
+    return _coloured(scene, loaded.texture, original, mesh)
+
+
+def _largest(mesh: meshes.Mesh, placement: Placement) -> float:
+    """Area of the largest triangle of the placed object."""
+    return float(meshes.areas(place(normalize(mesh[0]), placement)[mesh[1]]).max())
+
+
+def _template(triangles: int | None, faces: int) -> str:
+    """The room with the most walls that leaves the object enough."""
+    for name in ("corner", "wall"):
+        left = np.inf if triangles is None else triangles - WALL_FACES * len(TEMPLATES[name]) - len(LIGHTS)
+        if left >= min(faces, 2 * LEAST_FACES):
+            return name
+    return "floor"
+
+
+def decimated(vertices: np.ndarray, faces: np.ndarray, budget: int) -> tuple[meshes.Mesh, str]:
+    """The mesh with at most ``budget`` faces, and how it came about.
+
+    As *remesh* and *decimate* do it; a mesh that they refuse is collapsed as it is.
+    """
+    from pipeline.stage import Item, Record
+    from stages.graphics.geometry import decimator
+    from stages.renderformer.objects.rungs import load_rungs
+    from stages.renderformer.s01_remesh import Remesh, RemeshConfig
+    from stages.renderformer.s02_decimate import Decimate, DecimateConfig
+
+    class Held(dict):
+        """One record in the place of an artifact."""
+
+        def read(self, id: str) -> Record:
+            return self[id]
+
+    names = ("object_id", "content_hash", "family", "source", "origin", "licence")
+    record = MeshRecord("mesh", vertices.astype(np.float32), faces.astype(np.int32), dict.fromkeys(names, "")).to_record()
+    collect, item = Held(mesh=record), Item("mesh")
+    try:
+        (fine,) = Remesh().process((RemeshConfig(), collect), item)
+        config = DecimateConfig(budgets=[budget])
+        (record,) = Decimate().process((config, {"collect": collect, "remesh": Held(mesh=fine)}), item)
+        ((vertices, faces),) = load_rungs(record).values()
+        return (vertices.astype(np.float64), faces.astype(np.int64)), "remeshed and decimated"
+    except Reject as error:
+        mesh = decimator.collapse(*_welded(vertices, faces), budget, "fast_simplification", 0.0)
+        if len(mesh[1]) > budget or len(mesh[1]) == 0:
+            raise UserError(
+                f"a mesh of {len(faces):,} triangles cannot be decimated to {budget:,} ({error}): simplify it, or allow more "
+                "triangles (--triangles)"
+            ) from None
+        return mesh, f"decimated as they are ({error.reason} when remeshed)"
+
+
+def _welded(vertices: np.ndarray, faces: np.ndarray) -> meshes.Mesh:
+    """One vertex where several lie: files repeat them along texture seams, where shading is not to break."""
+    points, index = np.unique(vertices, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[faces]
+    return points, faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+
+
+def _material(colour: Sequence[float], specular: float = 0.0, roughness: float = 1.0, smooth: bool = False) -> Material:
+    bound = 1 - specular
+    return Material([bound * value for value in colour], specular, roughness, smooth, False, 0, bound)
+
+
+def _wall(name: str) -> Placement:
+    """Walls as wide as the law allows; the floor is raised so that object and camera fit as they do in the data."""
+    floor = name == "floor"
+    law = laws.WallLaw()
+    wide, near = law.scale[1], law.scale[0]
+    scale = [near if axis == laws.WALLS[name] else wide for axis in range(3)]
+    height = [0.0, 0.0, law.floor_offset_z[1] if floor else 0.0]
+    material = _material(FLOOR if floor else WALL_COLOURS[name])
+    if not floor:
+        scale[laws.WALLS[name]] = 1.0
+    return Placement(name, "wall", [0.0] * 3, scale, height, material)
+
+
+def _floor_height() -> float:
+    floor = _wall("floor")
+    return float(place(meshes.wall("floor")[0].astype(np.float64), floor)[:, 2].min())
+
+
+def _object(vertices: np.ndarray, turn: Sequence[float]) -> Placement:
+    """Turned upright, its bounding box in the middle, its lowest point on the floor, ``RADIUS`` around the box's centre."""
+    placement = Placement(
+        "object_0", "object", [float(angle) for angle in turn], [1.0] * 3, [0.0] * 3,
+        _material(OBJECT_COLOUR, SPECULAR, ROUGHNESS, smooth=True),
+    )  # fmt: skip
+    placed = place(normalize(vertices), placement)
+    low, high = placed.min(axis=0), placed.max(axis=0)
+    scale = RADIUS / float(np.linalg.norm(placed - (low + high) / 2, axis=1).max())
+    shift = -scale * np.array([*(low + high)[:2] / 2, low[2]]) + [0, 0, _floor_height() + 1e-4]  # no two faces in one plane
+    return replace(placement, scale=[scale] * 3, translation=(2 * shift).tolist())
+
+
+def _lights() -> list[Light]:
+    lights = []
+    for direction, share in LIGHTS.items():
+        away = np.array(direction) / np.linalg.norm(direction)
+        position = (LIGHT_DISTANCE * away).tolist()
+        turn = _turn_to(-away).tolist()
+        lights.append(
+            Light(away.tolist(), [0.0] * 3, LIGHT_DISTANCE, position, turn, [LIGHT_SCALE] * 3, share * LIGHT_RADIANCE)
+        )
+    return lights
+
+
+def _turn_to(direction: np.ndarray) -> np.ndarray:
+    """Degrees about x, y and z that turn the light triangle's normal to ``direction``."""
+    from scipy.spatial.transform import Rotation
+
+    normal = meshes.face_normals(meshes.LIGHT_TRIANGLE[None])[0]
+    axis = np.cross(normal, direction)
+    angle = np.arctan2(np.linalg.norm(axis), normal @ direction)
+    return Rotation.from_rotvec(axis * (angle / max(np.linalg.norm(axis), 1e-12))).as_euler("xyz", degrees=True)
+
+
+def _camera(template: str, points: np.ndarray) -> Camera:
+    """Looks at the middle of the object's ``points``, as far as the law lets it, and opens until the object fills its share."""
+    law = laws.CameraLaw()
+    direction = np.array(CAMERAS.get(template, CAMERA))
+    direction /= np.linalg.norm(direction)
+    look_at = np.clip((points.min(axis=0) + points.max(axis=0)) / 2, *law.look_at)
+    position = look_at + CAMERA_DISTANCE * direction
+    camera = Camera(direction.tolist(), look_at.tolist(), CAMERA_DISTANCE, position.tolist(), [0.0, 0.0, 1.0], 0.0)
+    seen = (points - position) @ camera_to_world(camera)[:3, :3]
+    needed = 2 * np.degrees(np.arctan(np.abs(seen[:, :2] / seen[:, 2:]).max() / FILLED))
+    return replace(camera, fov_deg=float(np.clip(needed, *law.fov_deg)))
+
+
+COLOUR_GRID = 4  # points per side of a triangle that its colour is the mean of
+
+
+def _coloured(scene: SceneRecord, texture: TextureRecord, original: meshes.Mesh, mesh: meshes.Mesh) -> SceneRecord:
+    """The object's triangles in the file's base colours: each the mean over the nearest points of the original."""
+    from stages.renderformer.scenes.textures import nearest_colours, seen_faces
+
+    vertices, faces = original
+    seen = None if len(faces) == len(mesh[1]) else seen_faces(vertices, faces)
+    row, column = np.nonzero(np.add.outer(np.arange(COLOUR_GRID), np.arange(COLOUR_GRID)) < COLOUR_GRID)
+    first, second = (column + 1 / 3) / COLOUR_GRID, (row + 1 / 3) / COLOUR_GRID
+    weights = np.stack([1 - first - second, first, second], axis=1)
+    points = np.einsum("pk,fkc->fpc", weights, np.asarray(mesh[0], np.float64)[mesh[1]])
+    colours = nearest_colours(texture, vertices, faces, seen)(points.reshape(-1, 3)).reshape(*points.shape[:2], 3).mean(axis=1)
+    diffuse = scene.diffuse.copy()
+    diffuse[scene.object_index == len(TEMPLATES[scene.meta["template"]])] = (1 - SPECULAR) * np.clip(colours, 0, 1)
+    return replace(scene, diffuse=diffuse)

@@ -1,0 +1,41 @@
+"""Files that are scenes, or become one: the one entrance of trace, predict and compare.
+
+Reads the released formats (``stages.renderformer.scenes.released``) as they are, and plain meshes with a default room around
+them (``stages.renderformer.inference.room``). One design choice: what cannot give a picture is refused here, for all commands
+alike.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.errors import UserError
+from stages.renderformer.inference.room import Room
+from stages.renderformer.records import SceneRecord
+
+SCENES = (".json", ".h5", ".hdf5")
+MESHES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+
+
+def load_scene(path: Path | str, triangles: int | None = None, room: Room | None = None) -> SceneRecord:
+    """The file as a SceneRecord with at least one camera and one light; a UserError says what is wrong with it.
+
+    triangles: a mesh is decimated so that its scene has at most so many; a scene file is taken as it is. room: of a mesh.
+    """
+    from stages.renderformer.inference.room import room_scene
+    from stages.renderformer.scenes import released
+
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SCENES + MESHES:
+        raise UserError(
+            f"{path} is neither a scene nor a mesh: expected {', '.join(SCENES)} (the released formats) or {', '.join(MESHES)}"
+        )
+    if not path.is_file():
+        raise UserError(f"{path} does not exist: give a scene or mesh file")
+    if suffix in MESHES:
+        return room_scene(path, triangles, room)
+    scene = released.load_scene(path)
+    if not scene.emission.any():
+        raise UserError(f"{path} has no light, its picture would be black: give an object an emissive colour above 0")
+    return scene

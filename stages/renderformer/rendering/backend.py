@@ -1,0 +1,175 @@
+"""Which Mitsuba variant works here: CUDA, LLVM with one of the installed libraries, or the scalar fall-back.
+
+A JIT compiler that does not fit the machine aborts the whole process (libLLVM 14 and 15 on recent CPUs), so each
+candidate proves itself in a child process that renders a tiny scene with the integrator of this package. The answer
+is plain JSON, which the render stage records and passes to its workers.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import functools
+import glob
+import importlib
+import itertools
+import json
+import logging
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import IO, Any
+
+from pipeline.errors import UserError
+
+CHOICES = ("auto", "cuda", "llvm", "scalar")
+VARIANTS = {"cuda": "cuda_ad_rgb", "llvm": "llvm_ad_rgb", "scalar": "scalar_rgb"}
+PROBE_SECONDS = 180.0  # the first CUDA kernel of a fresh machine takes tens of seconds
+FOLDERS = (
+    "/usr/lib",
+    "/usr/lib64",
+    "/usr/lib/*-linux-gnu",
+    "/usr/lib/llvm-*/lib",
+    "/usr/lib64/llvm*/lib",
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+    "/usr/local/opt/llvm*/lib",
+)
+INSTALL = "install libLLVM 16 or newer (Debian, Ubuntu: apt-get install libllvm19) for renders several times as fast"
+
+OUR_FAULT = 3  # exit status of a trial that failed by a mistake in this package
+
+log = logging.getLogger("lightmill")
+
+
+def llvm_libraries() -> list[str]:
+    """Paths of the libLLVM here, DRJIT_LIBLLVM_PATH first, then the newest first."""
+    found = set()
+    for folder in FOLDERS:
+        for name in ("libLLVM*.so*", "libLLVM*.dylib"):
+            found |= {os.path.realpath(path) for path in glob.glob(os.path.join(folder, name))}
+    ldconfig = shutil.which("ldconfig") or "/sbin/ldconfig"
+    if os.path.exists(ldconfig):
+        listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, check=False).stdout
+        found |= {os.path.realpath(path) for path in re.findall(r"=> (\S*libLLVM\S*)", listing)}
+
+    def version(path: str) -> tuple[list[int], str]:
+        return [int(number) for number in re.findall(r"\d+", os.path.basename(path))], path
+
+    ordered = sorted((path for path in found if os.path.isfile(path)), key=version, reverse=True)
+    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    return ([named] if named else []) + [path for path in ordered if path != named]
+
+
+def gpus() -> list[str]:
+    """NVIDIA GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if named is not None and named.strip() in ("", "-1"):
+        return []
+    if not shutil.which("nvidia-smi"):
+        return []
+    answer = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
+    found = re.findall(r"^GPU .*\(UUID: (\S+)\)", answer.stdout, re.MULTILINE) if answer.returncode == 0 else []
+    return named.split(",") if named and found else found
+
+
+_claims: list[IO] = []  # open lock files: a claim lasts as long as its process
+
+
+def claim_gpu() -> None:
+    """Keep this process to one GPU, the one that fewest render processes of this machine have claimed."""
+    here = gpus()
+    if len(here) < 2 or _claims:
+        return
+    folder = Path(tempfile.gettempdir()) / f"lightmill-gpus-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    for place, gpu in ((place, gpu) for place in itertools.count() for gpu in here):
+        file = (folder / f"{re.sub(r'[^A-Za-z0-9-]', '_', gpu)}.{place}").open("w")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+            continue
+        _claims.append(file)
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpu
+        return
+
+
+def candidates(choice: str) -> list[dict[str, Any]]:
+    """Backends to try for a choice of the config, best first."""
+    found: list[dict[str, Any]] = []
+    if choice in ("auto", "cuda") and gpus():
+        found.append({"backend": "cuda"})
+    if choice in ("auto", "llvm"):
+        found += [{"backend": "llvm", "library": path} for path in llvm_libraries()]
+    if choice in ("auto", "scalar"):
+        found.append({"backend": "scalar"})
+    return found
+
+
+def works(candidate: dict[str, Any]) -> bool:
+    """True if a child process renders the tiny scene with this backend. The scalar one needs no proof."""
+    return candidate["backend"] == "scalar" or _proof(json.dumps(candidate, sort_keys=True))
+
+
+@functools.cache
+def _proof(candidate: str) -> bool:
+    root = str(Path(__file__).resolve().parents[3])
+    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    command = [sys.executable, "-m", "stages.renderformer.rendering.trial", candidate]
+    try:
+        child = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, timeout=PROBE_SECONDS)
+    except subprocess.TimeoutExpired:
+        log.info("renderer %s did not finish its trial within %g s", candidate, PROBE_SECONDS)
+        return False
+    if child.returncode == OUR_FAULT:
+        raise RuntimeError(f"the renderer's trial failed by a mistake in lightmill:\n{child.stderr.decode(errors='replace')}")
+    if child.returncode:
+        log.info("renderer %s failed its trial: %s", candidate, child.stderr.decode(errors="replace").strip()[-300:])
+    return child.returncode == 0
+
+
+def choose(choice: str = "auto", previous: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The backend to render with, as plain JSON: ``{"backend": ..., "library": path of libLLVM}``.
+
+    ``previous`` is what an interrupted artifact was begun with: it is kept, as another one gives other bytes.
+    """
+    if choice not in CHOICES:
+        raise UserError(f"backend={choice!r} is unknown: choose from {', '.join(CHOICES)}")
+    if previous:
+        if works(previous):
+            return previous
+        raise UserError(
+            f"this artifact was begun with the backend {_title(previous)}, which does not work here: finish it "
+            "where it does, or start it anew with force=render"
+        )
+    for candidate in candidates(choice):
+        if works(candidate):
+            if candidate["backend"] == "scalar" and choice == "auto":
+                log.warning("no JIT backend of Mitsuba works here, rendering with scalar_rgb: %s", INSTALL)
+            return candidate
+    wanted = {"cuda": "an NVIDIA GPU and its driver", "llvm": "libLLVM 16 or newer, or DRJIT_LIBLLVM_PATH naming one"}
+    raise UserError(f"backend={choice} does not work here: it needs {wanted[choice]}; backend=auto takes what works")
+
+
+def _title(backend: dict[str, Any]) -> str:
+    return " with ".join(str(value) for _, value in sorted(backend.items()))
+
+
+def activate(backend: dict[str, Any], threads: int | None = None) -> None:
+    """Select the backend's Mitsuba variant in this process, with that many threads (None: all cores)."""
+    if backend.get("library"):
+        os.environ["DRJIT_LIBLLVM_PATH"] = backend["library"]  # read once, when Dr.Jit first compiles
+    if backend["backend"] == "cuda" and threads is not None:  # in a worker: others use the other GPUs
+        claim_gpu()
+    mitsuba = importlib.import_module("mitsuba")
+    drjit = importlib.import_module("drjit")
+    if mitsuba.variant() != VARIANTS[backend["backend"]]:
+        mitsuba.set_variant(VARIANTS[backend["backend"]])
+    if threads is not None:
+        drjit.set_thread_count(threads)
+        # Open Image Denoise reads these at its first use; pinned threads of several workers would share a core.
+        os.environ |= {"OIDN_NUM_THREADS": str(threads), "OIDN_SET_AFFINITY": "0"}

@@ -1,0 +1,400 @@
+"""Path tracing with an integrator of our own on Dr.Jit (CUDA or LLVM): radiance per light and first-hit layers in one
+pass.
+
+Light transport is linear, so one path serves all lights: each contribution goes to the slot of the light that it
+came from. The integrator keeps its own light arrays, picks a light triangle by power, lets it shine from both sides,
+and knows a light that a ray hits by its triangle index. Next-event estimation and BSDF sampling are combined by the
+power heuristic.
+
+One lane of the kernel traces a block of 8 to 64 samples of a pixel, the next one as soon as a path ends, and keeps their sums:
+lanes of a vector stay busy, and nothing is added by atomics. The host adds a pixel's blocks in order. A sample is a function of
+(seed, stream, view, pixel, number) only: the bytes are the same for any thread count and any chunk size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from stages.renderformer.records import SceneRecord
+from stages.renderformer.rendering.guiding import Guide, Trail, Unguided
+from stages.renderformer.rendering.lights import SLOTS, LightTable
+from stages.renderformer.rendering.material import Material
+from stages.renderformer.rendering.sobol import Sampler, mixed
+from stages.renderformer.rendering.sums import Sums
+from stages.renderformer.rendering.surfaces import Surfaces, gatherable, shape_mesh
+
+BLOCKS = (8, 64)  # samples of a lane, least and most
+LANES = 1 << 15  # of a view: enough to keep processors busy, so that lanes take more samples each
+GROUP = 64  # blocks of a pixel that the host adds at once
+CHUNK = 1 << 19  # lanes in flight: 40 floats of results each, about 80 MB
+RR_DEPTH = 5  # bounces before Russian roulette may end a path
+FILTER_CELLS = 1024
+BLACKMAN_HARRIS_SPAN = 3.0  # pixels from end to end: what Blender calls a width of 1.5
+# Dimensions of a bounce for the sampler; camera rays come before the first bounce.
+LIGHT_AND_LOBE, LIGHT_POINT, DIRECTION, ROULETTE, DIMENSIONS = range(5)
+GUIDE = 1 << 16  # behind those of all bounces: guided or not, the others stay as they are
+FILM = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How far paths go, and what is cut. Bounces are scattering events, light hits not counted."""
+
+    bounces: int
+    diffuse_bounces: int = 1 << 20
+    glossy_bounces: int = 1 << 20
+    indirect_clamp: float = float("inf")  # bound on the mean over RGB of one indirect contribution, after Cycles
+    filter: str = "box"
+    glossy_filter: bool = False  # after a wide scattering the lobe of the next surface is at least half as wide, after Cycles
+    multiscatter: bool = False  # between the facets of rough surfaces
+
+
+def filter_offsets(name: str) -> np.ndarray:
+    """Inverse cumulative distribution of the pixel filter: FILTER_CELLS + 1 offsets from the centre, in pixels.
+
+    Samples drawn from the filter itself need no weights, so a pixel stays the plain mean of its own samples.
+    """
+    u = np.linspace(0, 1, FILTER_CELLS + 1)
+    if name == "box":
+        return u - 0.5
+    assert name == "blackman-harris", name
+    x = np.linspace(-0.5, 0.5, 8 * FILTER_CELLS + 1)  # four-term Blackman-Harris window
+    angle = 2 * np.pi * (x + 0.5)
+    weight = 0.35875 - 0.48829 * np.cos(angle) + 0.14128 * np.cos(2 * angle) - 0.01168 * np.cos(3 * angle)
+    cumulative = np.concatenate([[0], np.cumsum(weight[1:] + weight[:-1])])
+    return BLACKMAN_HARRIS_SPAN * np.interp(u, cumulative / cumulative[-1], x)
+
+
+class Cameras:
+    """Rays of a scene's cameras through points of the pixels' filter; image row 0 is on top."""
+
+    def __init__(self, scene: SceneRecord, resolution: int, filter_name: str):
+        self.pose = gatherable(scene.camera_to_world[:, :3].reshape(-1, 12))
+        self.focal = gatherable(0.5 / np.tan(0.5 * np.radians(scene.fov_deg.astype(np.float64))))  # image width 1
+        self.filter = gatherable(filter_offsets(filter_name))
+        self.resolution = dr.opaque(mi.UInt32, resolution)
+
+    def ray(self, pixel: mi.UInt32, u: mi.Point2f) -> mi.Ray3f:
+        """``pixel`` counts row by row through all views; ``u`` in [0, 1)^2."""
+        side = self.resolution
+        view = pixel // (side * side)
+        inside = pixel - view * side * side
+        row = inside // side
+        column = inside - row * side
+        x = (mi.Float(column) + 0.5 + self._offset(u.x)) / mi.Float(side) - 0.5
+        y = (mi.Float(row) + 0.5 + self._offset(u.y)) / mi.Float(side) - 0.5
+        local = dr.normalize(mi.Vector3f(x, -y, -dr.gather(mi.Float, self.focal, view)))
+        entry = [dr.gather(mi.Float, self.pose, 12 * view + index) for index in range(12)]
+        direction = mi.Vector3f(
+            *[entry[4 * axis] * local.x + entry[4 * axis + 1] * local.y + entry[4 * axis + 2] * local.z for axis in range(3)]
+        )
+        return mi.Ray3f(mi.Point3f(entry[3], entry[7], entry[11]), dr.normalize(direction))
+
+    def _offset(self, u: mi.Float) -> mi.Float:
+        u = u * FILTER_CELLS
+        cell = dr.minimum(mi.UInt32(u), FILTER_CELLS - 1)
+        low, high = dr.gather(mi.Float, self.filter, cell), dr.gather(mi.Float, self.filter, cell + 1)
+        return low + (high - low) * (u - mi.Float(cell))
+
+
+class Points:
+    """Rays that end at given points from ``height`` above them: (N, 3) points and unit normals on the side that is asked."""
+
+    def __init__(self, points: np.ndarray, normals: np.ndarray, height: float):
+        self.origins, self.directions = gatherable(points + height * normals), gatherable(-normals)
+
+    def ray(self, pixel: mi.UInt32, u: mi.Point2f) -> mi.Ray3f:
+        return mi.Ray3f(dr.gather(mi.Point3f, self.origins, pixel), dr.gather(mi.Vector3f, self.directions, pixel))
+
+
+@dataclass
+class Lanes:
+    """What the lanes of a kernel trace: where their rays start, and which samples."""
+
+    start: Cameras | Points
+    pixel: mi.UInt32
+    view: mi.UInt32
+    key: mi.UInt32  # of the random numbers
+    first: mi.UInt32  # number of the first sample
+    count: mi.UInt32  # samples
+
+
+def _add(slots: list, slot: mi.Int32, value: mi.Color3f) -> list:
+    return [total + dr.select(slot == index, value, 0) for index, total in enumerate(slots)]
+
+
+@dr.syntax
+def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start, guide):
+    """Sums over the samples of each lane: (light slots, direct, albedo, normal, distance, hits, nearest distance, triangle).
+
+    ``limits``: opaque (bounces, diffuse bounces, glossy bounces, indirect clamp on the sum over RGB). ``hide``: opaque
+    bool, camera rays pass through lights. The triangle is that of the first sample, -1 where it hit nothing.
+    ``diffuse_start``: the first surface is a white diffuse one, whatever its material. ``guide`` learns, and picks directions.
+    """
+    max_bounces, max_diffuse, max_glossy, clamp = limits
+    slots = [mi.Color3f(0) for _ in range(SLOTS)]
+    direct, albedos, normals = mi.Color3f(0), mi.Color3f(0), mi.Normal3f(0)
+    distances, hits, nearest = mi.Float(0), mi.Float(0), mi.Float(dr.inf)
+    triangle = mi.Int32(-1)
+
+    done = mi.UInt32(0)
+    ray = dr.zeros(mi.Ray3f)
+    origin = mi.Point3f(0)
+    fresh = mi.Bool(True)
+    throughput, bsdf_pdf, widest = mi.Color3f(1), mi.Float(0), mi.Float(dr.inf)  # widest: least density so far
+    bounce, diffuse, glossy = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+    trail = Trail.none()
+
+    while done < lanes.count:
+        number = lanes.first + done
+        start = lanes.start.ray(lanes.pixel, Sampler(lanes.key, number).two(mi.UInt32(FILM)))
+        origin = dr.select(fresh, start.o, origin)
+        ray = dr.select(fresh, start, ray)
+        sampler = Sampler(lanes.key ^ pass_key, number)
+        dimension = bounce * DIMENSIONS
+
+        # without dPdUV: a frame that textures do not turn, so that the same samples go the same ways
+        si = scene.ray_intersect(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, False)
+        found = si.is_valid()
+        slot = dr.select(found, dr.gather(mi.Int32, lights.slot, si.prim_index, found), -1)
+        on_light = slot >= 0
+        through = on_light & (bounce == 0) & hide  # a camera ray goes on behind a hidden light
+
+        # First hit. The shading normal is turned to the viewer, as the two-sided material does.
+        first = found & (bounce == 0) & ~through
+        facing = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -1, 1)
+        distance = dr.norm(si.p - origin)
+        lobes = material.at(si, found)
+        normals += dr.select(first, si.sh_frame.n * facing, 0)
+        albedos += dr.select(first, lobes.diffuse + lobes.specular, 0)
+        distances += dr.select(first, distance, 0)
+        nearest = dr.minimum(nearest, dr.select(first, distance, dr.inf))
+        hits += dr.select(first, 1, 0)
+        triangle = dr.select(first & (done == 0), mi.Int32(si.prim_index), triangle)
+
+        # Emission met by chance: weighted against the chance of next-event estimation to find it.
+        hit = on_light & ~through & (slot < SLOTS)
+        cosine = dr.abs(dr.dot(si.n, ray.d))
+        light_pdf = dr.gather(mi.Float, lights.density, si.prim_index, hit) * si.t * si.t / dr.maximum(cosine, 1e-9)
+        weight = dr.select(bounce == 0, 1, mis_weight(bsdf_pdf, light_pdf))
+        value = throughput * dr.gather(mi.Color3f, lights.emission, si.prim_index, hit) * weight
+        value = dr.select(hit, clamped(value, dr.select(bounce > 1, clamp, dr.inf)), 0)
+        slots = _add(slots, slot, value)
+        direct += dr.select(bounce <= 1, value, 0)
+        guide.add(trail, value, hit & trail.further)
+
+        # Next-event estimation at surfaces; lights reflect nothing.
+        surface = found & ~on_light & (bounce < max_bounces) & (diffuse <= max_diffuse) & (glossy <= max_glossy)
+        if glossy_filter:
+            blurred = 0.5 * dr.sqrt(dr.maximum(1 - widest, 0))
+            lobes.alpha = dr.select(widest < 1, dr.maximum(lobes.alpha, blurred), lobes.alpha)
+        if diffuse_start:
+            white = bounce == 0
+            lobes.diffuse, lobes.specular = dr.select(white, 1, lobes.diffuse), dr.select(white, 0, lobes.specular)
+        spot = guide.at(lanes.view, si, lobes, surface)
+        choice = sampler.two(dimension + LIGHT_AND_LOBE)
+        lit, point = lights.sample(choice.x, sampler.two(dimension + LIGHT_POINT))
+        shadow = si.spawn_ray_to(point)
+        to_light = point - si.p
+        distance2 = dr.squared_norm(to_light)
+        to_light *= dr.rsqrt(dr.maximum(distance2, 1e-30))
+        cosine = dr.abs(dr.dot(dr.gather(mi.Normal3f, lights.normal, lit), to_light))
+        density = dr.gather(mi.Float, lights.density, lit)
+        sampled = surface & (cosine > 0) & (distance2 > 0) & (density > 0)
+        reflected, pdf = material.evaluate(lobes, si.wi, si.to_local(to_light))
+        sampled &= dr.max(reflected) > 0
+        sampled &= ~scene.ray_test(shadow, sampled)
+        light_pdf = density * distance2 / dr.maximum(cosine, 1e-9)
+        pdf = guide.density(pdf, spot, to_light)
+        value = throughput * reflected * dr.gather(mi.Color3f, lights.emission, lit) * (mis_weight(light_pdf, pdf) / light_pdf)
+        value = dr.select(sampled, clamped(value, dr.select(bounce > 0, clamp, dr.inf)), 0)
+        slots = _add(slots, dr.gather(mi.Int32, lights.slot, lit), value)
+        direct += dr.select(bounce == 0, value, 0)
+        guide.add(trail, value, sampled)
+
+        # The next direction, from the material or from what was learned.
+        within = sampler.two(dimension + DIRECTION)
+        wo, is_glossy = material.sample(lobes, si.wi, choice.y, within)
+        wo = guide.direction(wo, spot, si, sampler.two(dimension + GUIDE), within)
+        scattered, pdf = material.evaluate(lobes, si.wi, wo)
+        direction, arriving = si.to_world(wo), mi.Color3f(throughput)
+        pdf = guide.density(pdf, spot, direction)
+        glossy += dr.select(surface & is_glossy, 1, 0)
+        diffuse += dr.select(surface & ~is_glossy, 1, 0)
+        bounce += dr.select(surface, 1, 0)
+        throughput = dr.select(surface, throughput * dr.select(pdf > 0, scattered / pdf, 0), throughput)
+        bsdf_pdf = dr.select(surface, pdf, bsdf_pdf)
+        widest = dr.select(surface, dr.minimum(widest, pdf), widest)
+        brightest = dr.max(throughput)
+        survival = dr.select(bounce >= RR_DEPTH, dr.minimum(brightest, 0.95), 1)
+        lives = surface & (brightest > 0) & (sampler.one(dimension + ROULETTE) < survival)
+        throughput = dr.select(lives, throughput / survival, throughput)
+        ray = dr.select(through, si.spawn_ray(ray.d), si.spawn_ray(direction))
+
+        # The path goes on, or the lane's next sample begins.
+        fresh = ~(lives | through)
+        done += dr.select(fresh, 1, 0)
+        throughput, bsdf_pdf = dr.select(fresh, 1, throughput), dr.select(fresh, 0, bsdf_pdf)
+        widest = dr.select(fresh, dr.inf, widest)
+        trail = guide.step(trail, spot, direction, arriving, fresh)
+        bounce, diffuse, glossy = [dr.select(fresh, 0, count) for count in (bounce, diffuse, glossy)]
+
+    return slots, direct, albedos, normals, distances, hits, nearest, triangle
+
+
+def mis_weight(pdf, other):
+    """Power heuristic of the first strategy."""
+    square = pdf * pdf
+    return dr.select(pdf > 0, square / (square + other * other), 0)
+
+
+def clamped(value, limit):
+    """``value`` scaled so that its RGB sum is at most ``limit``."""
+    total = dr.sum(value)
+    return value * dr.select(total > limit, limit / total, 1)
+
+
+class JitRenderer:
+    """One scene, ready to be seen from its cameras."""
+
+    def __init__(
+        self, scene: SceneRecord, resolution: int, seed: int, limits: Limits, lights_visible: bool, guided: bool = False
+    ):
+        self.record, self.resolution, self.seed = scene, resolution, seed
+        self.limits, self.lights_visible = limits, lights_visible
+        surfaces = Surfaces(scene, np.arange(len(scene.triangles)))
+        self.scene = mi.load_dict({"type": "scene", "surface": shape_mesh(scene, surfaces)})
+        self.material = Material(surfaces, limits.multiscatter)
+        self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
+        self.guided = guided
+        self.guides = [Guide(scene) if guided else Unguided() for _ in self.passes]
+        self.cameras = Cameras(scene, resolution, limits.filter)
+
+    def learn(self, views: list[int]) -> None:
+        """Guide the paths of these views from now on by what those so far have brought."""
+        for guide in self.guides:
+            guide.learn(views)
+
+    def texel_sums(self, points: np.ndarray, normals: np.ndarray, height: float, spp: int) -> dict[str, np.ndarray]:
+        """Light that arrives at (N, 3) points, as seen from their normals' side on white diffuse material.
+
+        Sums over ``spp`` samples: ``lights`` (N, L, 3); and ``triangle`` (N,), which ``height`` above the point is met first.
+        """
+        start, ids = Points(points, normals, height), np.arange(len(points))
+        passes = [self._pass(table, number, start, ids, [0], 0, spp) for number, table in enumerate(self.passes)]
+        lights = np.concatenate([p["lights"][0] for p in passes], axis=-2)[:, : self.record.n_lights]
+        return {"lights": lights, "triangle": passes[0]["triangle"][0]}
+
+    def sample(self, views: list[int], streams: list[int], first: int, spp: int) -> list[list[Sums]]:
+        """Per stream, the sums of each view over the stream's samples ``first`` to ``first + spp`` of every pixel.
+
+        Streams share no path. A path serves all lights.
+        """
+        pixels = self.resolution * self.resolution
+        ids = np.concatenate([view * pixels + np.arange(pixels) for view in views])
+        passes = [self._pass(table, number, self.cameras, ids, streams, first, spp) for number, table in enumerate(self.passes)]
+        shape = (len(streams), len(views), self.resolution, self.resolution)
+        lights = np.concatenate([p["lights"] for p in passes], axis=-2)[..., : self.record.n_lights, :]
+        hit = passes[0]  # the camera rays of all passes are the same
+        images = {name: values.reshape(*shape, *values.shape[2:]) for name, values in hit.items()}
+        images["direct"] = sum(p["direct"] for p in passes).reshape(*shape, 3)
+        images["lights"] = np.moveaxis(lights.reshape(*shape, -1, 3), -2, 2)
+        return [
+            [Sums(spp, **{name: image[stream, view] for name, image in images.items()}) for view in range(len(views))]
+            for stream in range(len(streams))
+        ]
+
+    def _pass(
+        self,
+        table: LightTable,
+        number: int,
+        rays: Cameras | Points,
+        ids: np.ndarray,
+        streams: list[int],
+        first: int,
+        spp: int,
+    ) -> dict[str, np.ndarray]:
+        """(streams, pixels, ..) sums over the samples, float64; ``lights`` (.., lights of the pass, 3)."""
+        # of resolution and samples alone, since it decides how sums are rounded
+        fitting = self.resolution**2 * spp // LANES
+        size = min(max(1 << fitting.bit_length() >> 1, BLOCKS[0]), BLOCKS[1])
+        rows, blocks = len(streams) * len(ids), -(-spp // size)
+        sums: dict[str, np.ndarray] = {}
+        for block in range(0, blocks, GROUP):
+            depth = min(GROUP, blocks - block)
+            step = max(CHUNK // depth, 1)
+            for start in range(0, rows, step):
+                row = np.arange(start, min(start + step, rows)).repeat(depth)
+                number_of = block + np.tile(np.arange(depth), len(row) // depth)
+                counts = np.minimum(size, spp - number_of * size)
+                where = ids[row % len(ids)], np.asarray(streams)[row // len(ids)], first + number_of * size, counts
+                for name, value in self._chunk(table, number, rays, *where).items():
+                    parts = value.reshape(*value.shape[:-1], -1, depth)
+                    part = slice(start, start + parts.shape[-2])
+                    if name == "triangle":
+                        total = sums.setdefault(name, np.zeros(rows, np.int32))
+                        total[part] = parts[:, 0] if block == 0 else total[part]
+                    elif name == "nearest":
+                        total = sums.setdefault(name, np.full(rows, np.inf, np.float32))
+                        total[part] = np.minimum(total[part], parts.min(axis=-1))
+                    else:
+                        total = sums.setdefault(name, np.zeros((*value.shape[:-1], rows)))
+                        total[..., part] += parts.sum(axis=-1, dtype=np.float64)
+        shape = (len(streams), len(ids))
+        return {name: np.moveaxis(total, -1, 0).reshape(*shape, *total.shape[:-1]) for name, total in sums.items()}
+
+    def _chunk(
+        self,
+        table: LightTable,
+        number: int,
+        rays: Cameras | Points,
+        pixel: np.ndarray,
+        stream: np.ndarray,
+        first: np.ndarray,
+        count: np.ndarray,
+    ) -> dict[str, np.ndarray]:
+        """Every lane's sums, (.., lanes) float32."""
+
+        def opaque(value: int) -> mi.UInt32:
+            return dr.opaque(mi.UInt32, value & 0xFFFFFFFF)
+
+        places = (pixel, stream, pixel // self.resolution**2, first, count)
+        ids, streams, views, first, count = (gatherable(values, mi.UInt32) for values in places)
+        # the first two steps are one to one in the pixel: no two pixels of a stream share their numbers
+        key = mixed(mixed(mixed(ids + opaque(self.seed)) + opaque(self.seed >> 32)) + streams)
+        lanes = Lanes(rays, ids, views, key, first, count)
+        limits = self.limits
+        bounds = (
+            opaque(limits.bounces),
+            opaque(limits.diffuse_bounces),
+            opaque(limits.glossy_bounces),
+            dr.opaque(mi.Float, 3 * limits.indirect_clamp),
+        )
+        hide = dr.opaque(mi.Bool, not self.lights_visible)
+        pass_key = opaque(number * 0x5851F42D)
+        white = isinstance(rays, Points)
+        guide = Unguided() if white else self.guides[number]
+        out = trace_paths(self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, guide)
+        dr.eval(out)
+        slots, *wide, distances, hits, nearest, triangle = out
+        size = len(pixel)
+        return {
+            "lights": np.stack([_channels(slot, size) for slot in slots[: table.slots]]),
+            **{name: _channels(value, size) for name, value in zip(("direct", "albedo", "normal"), wide, strict=True)},
+            "distance": distances.numpy(),
+            "hits": hits.numpy(),
+            "nearest": nearest.numpy(),
+            "triangle": triangle.numpy(),
+        }
+
+
+def _channels(value, size: int) -> np.ndarray:
+    """(3, lanes) float32 from a three-channel value, which may be a literal."""
+    out = np.empty((3, size), np.float32)
+    for axis in range(3):
+        out[axis] = value[axis].numpy()
+    return out

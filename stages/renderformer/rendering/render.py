@@ -1,0 +1,163 @@
+"""``render_views``: the one entrance to path tracing, for the render stage, for ``lightmill trace`` and for
+experiments.
+
+Modes:
+- ``physical``: no clamping, box pixel filter, deep paths with Russian roulette, single-scattering GGX.
+- ``cycles``: Cycles' defaults as far as they can be matched: at most 12 bounces, 4 diffuse, 4 glossy, indirect contributions
+  clamped at 10, Blackman-Harris pixel filter (width 1.5), glossy filter 1.0, multiple-scattering GGX. Not matched: adaptive
+  sampling, Cycles' random numbers and its own choice of lights (which decides what the clamp cuts).
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import UserError
+from stages.graphics.denoising import denoise as denoise_layer
+from stages.renderformer.records import SceneRecord, ViewRecord
+from stages.renderformer.rendering import backend as backends
+from stages.renderformer.rendering.error import Judge
+from stages.renderformer.rendering.sums import Sums
+from stages.renderformer.views import clamped_values
+
+MODES = ("physical", "cycles")
+FIRST_SPP = 16  # before the first estimate
+FAR = 2.0  # times the target: a view whose first estimate is beyond loses its first samples, taken without guiding
+MIN_MEAN = 0.01  # mean radiance under which a view is dark
+MIN_DEPTH = 0.01  # nearest distance, scene units, under which a view is too close
+
+
+def render_views(
+    scene: SceneRecord,
+    resolution: int,
+    *,
+    max_spp: int,
+    seed: int,
+    backend: dict[str, Any],
+    target_error: float = 0.0,
+    views: Sequence[int] | None = None,
+    mode: str = "physical",
+    max_depth: int = 34,
+    denoise: bool = True,
+    lights_visible: bool = False,
+    threads: int | None = None,
+) -> list[ViewRecord]:
+    """Path trace ``views`` (indices of cameras; None: all) of a scene at ``resolution`` x ``resolution`` pixels.
+
+    max_spp: camera paths per pixel for the image with all lights on, at most. The JIT integrator shares each path among all
+        lights; the scalar one gives each light its share of the paths.
+    target_error: a view gets 16 samples, then 32, 48, 64, 96, 128, 192 .. until its estimated error
+        (``stages.renderformer.rendering.error``) is at most this, from the second portion on guided by what the first has found
+        (``stages.renderformer.rendering.guiding``); 0: ``max_spp`` at once, no guiding, and no estimate.
+    backend: from ``stages.renderformer.rendering.backend.choose``. max_depth: longest path in segments; 2 is direct light only.
+    lights_visible: whether camera rays see lights (reflections always do).
+    """
+    if mode not in MODES:
+        raise UserError(f"mode={mode!r} is unknown: choose from {', '.join(MODES)}")
+    backends.activate(backend, threads)
+    guided = target_error > 0 and max_spp > FIRST_SPP  # else there is no second portion to guide
+    renderer = _renderer(scene, resolution, seed, backend, mode, max_depth, lights_visible, guided)
+    records = {}
+    active = list(range(len(scene.camera_to_world))) if views is None else list(views)
+    order, taken = list(active), 0
+    # With a target, two streams that share no path: what tells noise from image.
+    streams = [0, 1] if target_error > 0 and max_spp > 1 else [0]
+    total = max_spp // len(streams)  # of each stream
+    step = min(FIRST_SPP // 2, total) if len(streams) > 1 else total
+    parts: dict[int, list[Sums]] = {view: [] for view in active}  # per stream
+    judges = {view: Judge(target_error, denoise) for view in active}
+    due = dict.fromkeys(active, 0.0)  # samples of a stream before which an estimate is not worth its cost
+    while active:
+        if taken:
+            renderer.learn(active)
+        sampled = renderer.sample(active, streams, taken, step)
+        taken += step
+        left = []
+        for view, new in zip(active, zip(*sampled, strict=True), strict=True):
+            mine = parts[view] = (
+                [before + more for before, more in zip(parts[view], new, strict=True)] if parts[view] else list(new)
+            )
+            if 1.5 * taken <= due[view] and taken < total:  # even the next count would not do
+                left.append(view)
+                continue
+            sums = functools.reduce(operator.add, mine)
+            whole, *halves = (part.view(scene.object_index) for part in (sums, *mine))
+            quality, error = "high" if denoise else None, None
+            if len(halves) > 1:
+                quality, error = judges[view].error(*halves, whole)
+            if taken == total or error is None or error <= target_error:
+                records[view] = _finish(whole, sums, view, quality, error, len(streams) * taken - sums.spp)
+                del parts[view]
+                continue
+            left.append(view)
+            if renderer.guided and taken == step and total >= 2 * taken and error > FAR * target_error:
+                parts[view] = []  # guided samples are so much better that these would only harm
+            else:  # no error falls faster than by the square root, and denoised ones do not reach it
+                due[view] = taken + ((error / target_error) ** (2.5 if denoise else 2.0) - 1) * mine[0].spp
+        active, step = left, min(_next(taken) - taken, total - taken)
+    return [records[view] for view in order]
+
+
+def _next(samples: int) -> int:
+    """Of 16, 24, 32, 48, 64, 96 .. the one after ``samples``; 16 after 8."""
+    if samples <= 8:
+        return 16
+    power_of_two = samples & (samples - 1) == 0
+    return samples * 3 // 2 if power_of_two else samples * 4 // 3
+
+
+def _renderer(
+    scene: SceneRecord,
+    resolution: int,
+    seed: int,
+    backend: dict[str, Any],
+    mode: str,
+    max_depth: int,
+    lights_visible: bool,
+    guided: bool,
+) -> Any:
+    """A ``ScalarRenderer`` or ``JitRenderer``; guided where it can be and nothing is clamped."""
+    if backend["backend"] == "scalar":
+        if mode == "cycles":
+            raise UserError("mode=cycles needs a JIT backend of Mitsuba, and none works here: " + backends.INSTALL)
+        from stages.renderformer.rendering.scalar import ScalarRenderer
+
+        return ScalarRenderer(scene, resolution, seed, max_depth, lights_visible)
+    from stages.renderformer.rendering.jit import JitRenderer, Limits
+
+    if mode == "physical":
+        return JitRenderer(scene, resolution, seed, Limits(max_depth - 1), lights_visible, guided)
+    # Cycles lets light in at the hit behind the last counted bounce, hence 12 + 1.
+    bounces = min(max_depth - 1, 13)
+    limits = Limits(bounces, 4, 4, 10.0, "blackman-harris", glossy_filter=True, multiscatter=True)
+    return JitRenderer(scene, resolution, seed, limits, lights_visible)
+
+
+def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error: float | None, dropped: int) -> ViewRecord:
+    """The stored view: every light denoised on its own (quality None: not at all), and what is to be said of it."""
+    nearest = float(sums.nearest.min())
+    if quality:
+
+        def clean(radiance: np.ndarray) -> np.ndarray:
+            return denoise_layer(radiance, view.albedo, view.normal, view.coverage, quality)
+
+        view.lights = np.stack([clean(light) for light in view.lights]) if len(view.lights) else view.lights
+        view.direct = clean(view.direct)
+    mean = float(view.image.mean(dtype=np.float64))
+    view.meta = {
+        "index": int(index),
+        "status": "too_close" if nearest < MIN_DEPTH else "dark" if mean < MIN_MEAN else "ok",
+        "mean": mean,
+        "spp": sums.spp,
+        "dropped": dropped,
+        "error": error,
+        "denoiser": quality,
+        "clamped": clamped_values(view),
+        "nearest": nearest if np.isfinite(nearest) else None,
+    }
+    return view

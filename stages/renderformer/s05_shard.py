@@ -1,0 +1,154 @@
+"""shard: scenes and their images as the dataset: webdataset tars, an index and a card.
+
+Reads *scene* and *render*, writes one sample per scene: ``scene.npz`` (compact, ``stages.renderformer.dataset.encoding``),
+``meta.json``, and ``view<i>.exr`` and ``view<i>.aov.exr`` for every kept view i, copied unchanged. One design choice: the
+store's parts *are* the shards, so that plain ``webdataset`` reads them where they lie and nothing is stored twice. Samples
+lie in order of id, which is a random order already: every scene is an independent draw. Paper section 3.3.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import zlib
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from pydantic import Field
+
+from pipeline.config import StageConfig
+from pipeline.errors import UserError
+from pipeline.stage import Inputs, Item, MapStage, Record
+from stages.renderformer.views import VIEW, view_members
+
+CARD = "README.md"
+
+
+class ShardConfig(StageConfig):
+    shard_mb: float = Field(256.0, gt=0)  # size that shards come near: a power of two of scenes each
+
+
+class Shard(MapStage):
+    name = "shard"
+    version = 2
+    headline = "card.html"
+    inputs = ("scene", "render")
+    Config = ShardConfig
+
+    def slug(self, config: ShardConfig) -> str:
+        return f"{config.shard_mb:g}mb"
+
+    def part_size(self, config: ShardConfig, inputs: Inputs) -> int:
+        """Scenes per shard: the power of two nearest to the target, by the mean bytes of a rendered scene.
+
+        A power of two, so that a dataset that grows keeps its full shards although the mean has moved a little.
+        """
+        rows = inputs["render"].rows()
+        mean = sum(size for row in rows for _, size in row.members.values()) / max(len(rows), 1)
+        return 2 ** max(0, round(math.log2(config.shard_mb * 1e6 / max(mean, 1.0))))
+
+    def items(self, config: ShardConfig, inputs: Inputs) -> Iterator[Item]:
+        for row in inputs["render"].rows():
+            yield Item(row.id, row.group, (("scene", row.id), ("render", row.id)))
+
+    def open(self, config: ShardConfig, inputs: Inputs, environment: dict[str, Any]) -> Inputs:
+        return inputs
+
+    def process(self, worker: Inputs, item: Item) -> Iterator[Record]:
+        yield merge(worker["scene"].read(item.id), worker["render"].read(item.id))
+
+    def finish(self, config: ShardConfig, inputs: Inputs, draft: Any) -> None:
+        """``files/``: ``index.jsonl``, ``shards.json``, ``objects.json``, and the card with its pictures."""
+        from pipeline.store.files import write_jsonl
+        from stages.graphics.arrays import unpack_json
+        from stages.renderformer.dataset.card import write_card
+
+        shards: dict[str, Any] = {}
+        objects: dict[str, Any] = {}
+        digests: dict[str, Any] = {}
+
+        def index() -> Iterator[dict[str, Any]]:
+            for row in draft.rows():
+                data = draft.read(row.id, ["meta.json"]).members["meta.json"]
+                meta = unpack_json(data)
+                crc = {**meta["crc32"], "meta.json": zlib.crc32(data)}
+                path, split = draft.part_of(row.id)
+                note_objects(objects.setdefault(split, {}), meta)
+                shard = shards.setdefault(split, {"samples": 0, "parts": []})
+                shard["samples"] += 1
+                if not shard["parts"] or shard["parts"][-1]["path"] != f"parts/{path.name}":
+                    shard["parts"].append({"path": f"parts/{path.name}", "bytes": path.stat().st_size, "samples": 0})
+                shard["parts"][-1]["samples"] += 1
+                content = digests.setdefault(split, hashlib.blake2b(digest_size=16))
+                content.update(json.dumps([row.id, row.digest]).encode())
+                yield {
+                    "id": row.id,
+                    "split": split,
+                    "shard": f"parts/{path.name}",
+                    "triangles": meta["n_triangles"],
+                    "lights": meta["n_lights"],
+                    "views": meta["views"],
+                    "resolution": meta["resolution"],
+                    "scene": f"{meta['template']}_{meta['variant']}" if "variant" in meta else meta["template"],
+                    "members": {name: [*row.members[name], crc[name]] for name in sorted(row.members)},
+                }
+
+        write_jsonl(draft.files / "index.jsonl", index())
+        for split, shard in shards.items():
+            shard["bytes"] = sum(part["bytes"] for part in shard["parts"])
+            shard["digest"] = digests[split].hexdigest()
+        for name, value in (("shards", shards), ("objects", objects)):
+            (draft.files / f"{name}.json").write_text(json.dumps(value, indent=1, sort_keys=True) + "\n")
+        write_card(config, inputs, draft)
+        draft.note("shards", {split: {**shard, "parts": len(shard["parts"])} for split, shard in shards.items()})
+
+    def check(self, draft: Any) -> None:
+        seen: dict[str, str] = {}
+        for split, ids in json.loads((draft.files / "objects.json").read_text()).items():
+            for id in ids:
+                if seen.setdefault(id, split) != split:
+                    raise UserError(
+                        f"object {id} is in the splits {seen[id]} and {split}: images of it would leak into the test"
+                    )
+
+
+def note_objects(objects: dict[str, Any], meta: dict[str, Any]) -> None:
+    """Add the objects of a scene: where each is from and under which licence."""
+    for entry in meta["objects"]:
+        if entry.get("object_id"):
+            told = {name: entry.get(name) for name in ("family", "source", "origin", "licence")}
+            objects.setdefault(entry["object_id"], {**told, "scenes": 0})["scenes"] += 1
+
+
+def merge(scene: Record, render: Record) -> Record:
+    """One sample: the scene's arrays made compact, both metas, and the images byte for byte.
+
+    ``meta["views"]`` lists the camera index of each kept view in order, ``meta["render"]`` is what the renderer noted,
+    ``meta["crc32"]`` maps each other member to the CRC-32 of its bytes.
+    """
+    from stages.graphics.arrays import unpack_json
+    from stages.graphics.exr import size_of
+    from stages.renderformer.dataset.encoding import encode_scene
+    from stages.renderformer.records import SceneRecord
+
+    views = views_of(render.members)
+    record = SceneRecord.from_record(scene)
+    members = {name: render.members[name] for index in views for name in view_members(index)}
+    members = {"scene.npz": encode_scene(record), **members}
+    meta = {
+        **record.meta,
+        "n_triangles": len(record.triangles),
+        "n_lights": record.n_lights,
+        "views": views,
+        "resolution": size_of(members[view_members(views[0])[0]])[0],
+        "render": unpack_json(render.members["meta.json"]),
+        "crc32": {name: zlib.crc32(data) for name, data in members.items()},
+    }
+    plain = json.dumps(meta, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
+    return Record(scene.id, {"meta.json": plain.encode(), **members})
+
+
+def views_of(members: Iterable[str]) -> list[int]:
+    """Camera indices of the images among a record's members, in order."""
+    return sorted(int(match[1]) for name in members if (match := VIEW.match(name)))

@@ -1,0 +1,382 @@
+"""Stage 6, train: the shards to a RenderFormer checkpoint (section 3.3).
+
+Reads the train and validation splits of *shard*; writes ``checkpoint/`` in the released format (the model after the last
+step: with a cosine to zero that is the one to use, and nothing is chosen by looking at validation), ``best/`` (the one with the
+lowest validation error, should the last be worse), ``log.jsonl``, ``curve.png``, ``validation/`` (pictures of fixed views) and
+``tensorboard/``. The loop itself is ``model.renderformer.training.fit``; this module binds it to configs, artifacts and
+files. Started by ``torchrun``, the first process leads and the others follow.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field, model_validator
+
+from pipeline.config import Section, StageConfig, added, runtime
+from pipeline.errors import UserError
+from pipeline.stage import Inputs, RunStage
+from stages.graphics.device import choose_device
+from stages.renderformer.dataset import BatchConfig, Relight
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from model.renderformer.config import ModelConfig
+    from model.renderformer.network import RenderFormer
+    from model.renderformer.training import FitConfig
+    from model.training.parallel import Group
+    from pipeline.store import Draft
+
+
+class ModelSection(Section):
+    """The network, in the released config's field names (``model.renderformer.config.ModelConfig``, where each is
+    explained).
+    """
+
+    name: str = runtime("custom")  # for people: the variant's file name; what it holds is in the fields below
+    latent_dim: int = 768
+    num_layers: int = 12
+    num_heads: int = 6
+    dim_feedforward: int = 3072
+    num_register_tokens: int = 16
+    texture_channels: int = 13
+    texture_encode_patch_size: int = 32
+    vn_pe_num_freqs: int = 6
+    pe_type: str = "rope"
+    vertex_pe_num_freqs: int = 12
+    rope_double_max_freq: bool = False
+    view_transformer_latent_dim: int = 768
+    view_transformer_n_layers: int = 6
+    view_transformer_n_heads: int = 6
+    view_transformer_ffn_hidden_dim: int = 3072
+    view_transformer_include_self_attn: bool = True
+    view_transformer_use_swin_attn: bool = False
+    turn_to_cam_coord: bool = True
+    use_dpt_decoder: bool = True
+    dpt_features: int = 128
+    dpt_out_channels: tuple[int, ...] = (96, 192, 384, 768)
+    dpt_out_layers: tuple[int, ...] | None = None
+
+    @model_validator(mode="after")
+    def _computable(self) -> ModelSection:
+        self.build()
+        return self
+
+    def build(self) -> ModelConfig:
+        """As the network's own config, which refuses what it cannot compute."""
+        from model.renderformer.config import ModelConfig
+
+        return ModelConfig(**self.model_dump(exclude={"name"}))
+
+
+class TrainConfig(StageConfig):
+    seed: int = 0
+    model: ModelSection = ModelSection()
+    # Schedule
+    steps: int = Field(1500, ge=1)
+    batch_scenes: int = Field(4, ge=1)
+    views_per_scene: int = Field(4, ge=1)
+    lr: float = Field(1e-3, gt=0)
+    warmup: int = Field(50, ge=0)  # steps
+    decay_steps: int | None = Field(None, ge=1)  # step at which the cosine ends; null: the last step
+    final_lr: float = Field(0.0, ge=0, le=1)  # after the cosine, as a share of lr
+    optimizer: Literal["adamw", "muon"] = "muon"
+    muon_lr: float = Field(0.005, gt=0)  # highest learning rate of Muon's weights: a step's size in spectral norm
+    weight_decay: float = Field(0.01, ge=0)
+    clip: float = Field(1.0, gt=0)  # largest gradient norm
+    ema: float = added(0.0, 0.0, ge=0, lt=1)  # decay of the averaged weights that are validated and saved; 0: none
+    # mixed: view-independent stage in bfloat16 and TF32 in the other on a GPU, fp32 on a CPU; bf16: all in bfloat16, anywhere
+    precision: Literal["mixed", "fp32", "bf16"] = "mixed"
+    init_from: str | None = runtime(None)  # checkpoint folder or train artifact to start from; its content counts, not its path
+    # Loss: L1 on log10(1 + x) + lpips * LPIPS(VGG)
+    lpips: float = Field(0.0, ge=0)
+    # Share of the gradient that pixels below 0 get besides ELU's own 1e-3: at high learning rates the output else dies
+    gradient_leak: float = Field(0.1, ge=0, le=1)
+    # Initial values that say what is known (model.renderformer.initial), for runs of minutes.
+    # inputs: of materials and normals, not of rays
+    informed_start: bool | Literal["inputs"] = True
+    # Augmentation
+    rotate: bool = False  # turn the scene at random: the view-independent stage must not learn an orientation
+    translate_sigma: float = Field(0.0, ge=0)  # and move it; scene units
+    mirror: bool = False  # x -> -x, for half of the samples
+    relight: bool = True  # reweight the lights' own images: light transport is linear
+    lighting: Relight = Relight()  # what relight draws from
+    exposure_stops: float = added(0.0, 0.0, ge=0)  # radiance and emission times 2^U(-s, s)
+    max_triangles: int | None = Field(None, ge=1)  # scenes with more are left out; null: none is
+    shuffle_shards: int = added(0, 0, ge=0)  # scenes are shuffled over this many shards at a time; 0: over the whole split
+    bucket: int = added(0, 0, ge=0)  # scenes of this many batches are sorted by triangle count together; 0: not sorted
+    # Runtime
+    lpips_folder: str | None = runtime(None)  # folder with the published LPIPS weights
+    micro_scenes: int | None = runtime(None, ge=1)  # scenes of a process in memory at once, gradients add up; null: all
+    activation_checkpointing: bool = runtime(False)  # compute activations again instead of keeping them
+    parallel: Literal["ddp", "fsdp"] = runtime("ddp")  # under torchrun: whole models, or one split over the processes
+    device: str = runtime("auto")  # auto | cpu | cuda
+    compile: bool = runtime(False)  # torch.compile
+    threads: int | None = runtime(None, ge=1)  # CPU threads; null: torch's choice
+    ahead: int = runtime(4, ge=1)  # batches that are read ahead
+    loader_workers: int = runtime(0, ge=0)  # processes that decode them; 0: threads of this one
+    log_every: int = runtime(50, ge=1)  # steps
+    validate_every: int = runtime(200, ge=1)
+    validation_scenes: int = runtime(16, ge=1)
+    validate_on: Literal["validation", "train"] = runtime("validation")  # train: how well it fits what it sees
+    pictures: int = runtime(6, ge=0)  # validation scenes that are shown
+    checkpoint_every: int = runtime(100, ge=1)
+    tensorboard: bool = runtime(True)  # events besides log.jsonl
+
+    @model_validator(mode="after")
+    def _startable(self) -> TrainConfig:
+        model = self.model
+        if self.informed_start is True and self.init_from is None and not (model.pe_type == "rope" and model.turn_to_cam_coord):
+            raise ValueError(
+                f"informed_start=true aims rays by rotary positions in the camera frame, which {model.name} does not have: "
+                "set train.informed_start=inputs or false"
+            )
+        return self
+
+    def batches(self) -> BatchConfig:
+        """The loader's part: the fields of the same names."""
+        return BatchConfig(**{name: getattr(self, name) for name in BatchConfig.model_fields if hasattr(self, name)})
+
+    def fit(self, device: str) -> FitConfig:
+        """The loop's part: the fields of the same names."""
+        import dataclasses
+
+        from model.renderformer.training import FitConfig
+
+        names = {field.name for field in dataclasses.fields(FitConfig)} & type(self).model_fields.keys()
+        values = {name: getattr(self, name) for name in names} | {
+            "lpips_folder": Path(self.lpips_folder).expanduser() if self.lpips_folder else None,
+            "precision": "fp32" if self.precision == "mixed" and device == "cpu" else self.precision,
+            "sharded": self.parallel == "fsdp",
+        }
+        return FitConfig(**values)
+
+
+class Train(RunStage):
+    name = "train"
+    version = 3
+    inputs = ("shard",)
+    Config = TrainConfig
+
+    def slug(self, config: TrainConfig) -> str:
+        return config.model.name
+
+    def identity(self, config: TrainConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
+        if config.init_from is None:
+            return {}
+        folder = initial_folder(config.init_from)
+        return {"init_from": {name: hash_file(folder / name) for name in ("config.json", "model.safetensors")}}
+
+    def estimate(self, config: TrainConfig, configs: Mapping[str, StageConfig]) -> list[str]:
+        return estimate(config, configs)
+
+    def run(self, config: TrainConfig, inputs: Inputs, draft: Draft) -> list[str]:
+        from model.training.parallel import join
+
+        with join(choose_device(config.device, "train.device")) as group:
+            group.tell(str(draft.state))
+            summary = self._train(config, inputs, group, draft.state, draft.files, draft.log)
+        for name, where in (("last", "checkpoint"), ("best", "best")):
+            if (draft.state / name).is_dir():
+                shutil.copytree(draft.state / name, draft.files / where, dirs_exist_ok=True)
+        rows = [json.loads(line) for line in (draft.state / "log.jsonl").read_text().splitlines()]
+        (draft.files / "log.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+        plot_curve(rows, draft.files / "curve.png", f"{config.model.name}, {config.steps:,} steps")
+        draft.note("training", summary)
+        return ["checkpoint/config.json", "checkpoint/model.safetensors"]
+
+    def follow(self, config: TrainConfig, inputs: Inputs) -> None:
+        from model.training.parallel import join
+
+        with join(choose_device(config.device, "train.device")) as group:
+            self._train(config, inputs, group, Path(group.tell("")), None, lambda text: None)
+
+    def _train(
+        self, config: TrainConfig, inputs: Inputs, group: Group, state: Path, files: Path | None, say: Callable[[str], None]
+    ) -> dict[str, Any]:
+        """This process's part; ``files`` only for the one that leads."""
+        import torch
+
+        from model.renderformer.network import RenderFormer
+        from model.renderformer.training import fit
+        from stages.renderformer.dataset import Batches, ShardDataset, evaluation_samples, prefetch
+
+        if config.threads is not None:
+            torch.set_num_threads(config.threads)
+        # a well-trained network's attention is full of numbers below 1e-38, which a CPU computes many times slower than zeros;
+        # before the first parallel operation, as threads take the setting of the one that starts them
+        torch.set_flush_denormal(True)
+        train = ShardDataset(inputs["shard"], "train", config.max_triangles)
+        validation = train
+        if config.validate_on != "train":
+            validation = ShardDataset(inputs["shard"], config.validate_on, config.max_triangles)
+        batches = Batches(train, config.batches(), group.rank, group.world)
+        held_out = list(itertools.islice(evaluation_samples(validation), config.validation_scenes))
+
+        torch.manual_seed(config.seed)
+        model = RenderFormer(config.model.build())
+        start(model, config)
+        processes = f", {group.world} processes" if group.world > 1 else ""
+        say(
+            f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f}M parameters ({config.model.name}) on {group.device}, "
+            f"{torch.get_num_threads()} threads{processes}; {len(train)} training and {len(validation)} validation scenes; "
+            + (f"starting from {config.init_from}" if config.init_from else "starting from scratch")
+        )
+        multiple = model.config.resolution_multiple
+        if train.resolution % multiple:
+            raise UserError(
+                f"images of {train.resolution} px cannot train {config.model.name}: its resolution must be a "
+                f"multiple of {multiple} (render.resolution)"
+            )
+        return fit(
+            model,
+            config.fit(group.device.type),
+            lambda start, stop: prefetch(batches, start, stop, config.ahead, config.loader_workers),
+            held_out,
+            state,
+            group,
+            say,
+            show=None if files is None else lambda step, pairs: show(files / "validation", step, pairs),
+            tensorboard=files / "tensorboard" if files is not None and config.tensorboard else None,
+            trained_with={"triangles": str(train.triangles.max()), "resolution": str(train.resolution)},
+        )
+
+
+def initial_folder(reference: str) -> Path:
+    """The checkpoint folder that ``train.init_from`` names: itself, or inside a train artifact's folder."""
+    folder = Path(reference).expanduser()
+    for found in (folder, folder / "files" / "checkpoint"):
+        if (found / "config.json").is_file() and (found / "model.safetensors").is_file():
+            return found
+    raise UserError(
+        f"train.init_from={reference} holds no checkpoint: give a folder with config.json and model.safetensors, or that of a "
+        "finished train artifact (store/train/...)"
+    )
+
+
+def start(model: RenderFormer, config: TrainConfig) -> None:
+    """Give the model its initial values: another run's, informed ones, or those of its layers."""
+    if config.init_from is None:
+        if config.informed_start:
+            from model.renderformer.initial import start_informed
+
+            start_informed(model, rays=config.informed_start is True)
+        return
+    from model.renderformer import checkpoint
+
+    other, _ = checkpoint.load(initial_folder(config.init_from))
+    own, theirs = model.config.to_dict(), other.config.to_dict()
+    different = [f"{name} {theirs[name]} instead of {own[name]}" for name in own if own[name] != theirs[name]]
+    if different:
+        raise UserError(f"train.init_from={config.init_from} is another network: {', '.join(different)} (choose model=...)")
+    model.load_state_dict(other.state_dict())
+
+
+def show(folder: Path, step: int, pairs: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """References above, predictions below, each pair at the reference's exposure; also written as ``step-<step>.png``."""
+    import numpy as np
+    from PIL import Image
+
+    from stages.graphics.tonemap import exposure_for, to_picture
+
+    columns = []
+    for reference, prediction in pairs:
+        exposure = exposure_for(reference)
+        columns.append(np.concatenate([to_picture(image, exposure) for image in (reference, prediction)]))
+    picture = np.concatenate(columns, axis=1)
+    folder.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(picture).save(folder / f"step-{step:07}.png")
+    return picture
+
+
+A100_TFLOPS = {"float32": 156.0, "bfloat16": 312.0}  # its data sheet's, float32 products in TF32
+UTILISATION = 0.4  # of that, assumed
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Of a whole training run: floating-point operations, and days of one A100 at `UTILISATION`."""
+
+    flops: float
+    days: float
+
+
+def sizes(config: TrainConfig, configs: Mapping[str, StageConfig]) -> tuple[int | None, int | None]:
+    """Pixels per side and most triangles of a scene; None where the data does not say."""
+    largest = config.max_triangles or getattr(configs.get("scene"), "max_triangles", None)
+    return getattr(configs.get("render"), "resolution", None), largest
+
+
+def cost(config: TrainConfig, configs: Mapping[str, StageConfig]) -> Cost | None:
+    """With every scene as large as allowed; None where the data does not say how large that is."""
+    from model.renderformer.flops import TRAINING, forward_flops, ideal_seconds
+
+    side, largest = sizes(config, configs)
+    if side is None or largest is None:
+        return None
+    flops = forward_flops(config.model.build(), [largest], config.views_per_scene, side, side)
+    peaks = {name: value * 1e12 * UTILISATION for name, value in A100_TFLOPS.items()}
+    scenes = TRAINING * config.batch_scenes * config.steps
+    return Cost(scenes * sum(flops.values()), scenes * ideal_seconds(flops, peaks, config.precision) / 86400)
+
+
+def estimate(config: TrainConfig, configs: Mapping[str, StageConfig]) -> list[str]:
+    """What data and training cost, at most: every scene as large as allowed, every pixel with all its samples."""
+    lines = []
+    network = config.model.build()
+    scene, render = configs.get("scene"), configs.get("render")
+    side, largest = sizes(config, configs)
+    if hasattr(scene, "count") and render is not None:
+        images = sum(scene.count.model_dump().values()) * scene.cameras.views
+        adaptive = f", fewer where the error is under {render.target_error:g}" if render.target_error else ""
+        visits = config.steps * config.batch_scenes / max(1, scene.count.train)
+        lines += [
+            f"data: {scene.count.train:,} training scenes of at most {scene.max_triangles:,} triangles; {images:,} images of "
+            f"{side} px in all splits, {images * side**2 * render.max_spp:.2e} camera paths to render "
+            f"(at most {render.max_spp:,} per pixel{adaptive})",
+            f"visits: {visits:.1f} of each training scene",
+        ]
+    paid = cost(config, configs)
+    if paid is None:
+        return [*lines, "training: cost unknown, the data does not say its resolution or its triangles"]
+    rays = config.views_per_scene * (side // network.patch_size) ** 2
+    tokens = (largest + network.num_register_tokens + rays) * config.batch_scenes
+    return [
+        *lines,
+        f"training: {config.steps:,} steps of {config.batch_scenes} scenes x {config.views_per_scene} views, "
+        f"{tokens:,} tokens a step, {tokens * config.steps:.2e} in all",
+        f"compute: {paid.flops / config.steps:.2e} FLOPs a step, {paid.flops:.2e} in all; {paid.days:.3g} days of one A100, "
+        f"{paid.days / 8:.3g} of eight (at {UTILISATION:.0%} of its peak, {config.precision} precision)",
+        "start: "
+        + (f"from {config.init_from}" if config.init_from else "from scratch (train.init_from=FOLDER: from another run)"),
+    ]
+
+
+def plot_curve(rows: list[dict[str, Any]], path: Path, title: str) -> None:
+    """Training loss and validation error over steps on the left, validation PSNR on the right."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.add_subplot()
+    right = axes.twinx()
+    lines = []
+    for where, key, label, style in (
+        (axes, "loss", "training loss", "C0-"),
+        (axes, "validation_log_error", "validation, log error", "C1o-"),
+        (right, "validation_psnr", "validation, PSNR", "C2.--"),
+    ):
+        points = [(row["step"], row[key]) for row in rows if row.get(key) is not None]
+        if points:
+            lines += where.plot(*zip(*points, strict=True), style, label=label, markersize=3, linewidth=1.2)
+    axes.set(xlabel="step", ylabel="L1 of log10(1 + radiance)", title=title, yscale="log")
+    right.set(ylabel="PSNR (dB)")
+    axes.grid(alpha=0.3, which="both")
+    figure.legend(handles=lines, loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(path, dpi=120)
