@@ -20,7 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.store import Artifact, Store, iter_inputs
-from stages.graphics.exr import _decode, decode_lights
+from stages.graphics import exr
+from stages.graphics.exr import decode_lights
 from stages.renderformer.dataset import BatchConfig, Batches, Relight, ShardDataset, prefetch
 from stages.renderformer.dataset.encoding import decode_scene
 from stages.renderformer.dataset.interchange import write_hdf5
@@ -183,7 +184,7 @@ def exr_table(dataset: ShardDataset, views: int = 16) -> None:
     print(f"EXR compression ({len(samples)} views; ms of CPU time per view)")
     for suffix, words in ((".exr", "lights"), (".aov.exr", "AOVs")):
         images = [
-            _decode(data, name)[1]
+            exr.decode(data, name)[1]
             for members in samples
             for name, data in members.items()
             if name.endswith(suffix) and name.endswith(".aov.exr") == (suffix == ".aov.exr")
@@ -200,9 +201,9 @@ def exr_table(dataset: ShardDataset, views: int = 16) -> None:
                     encoded.append(buffer.getvalue())
 
             encoding = cpu(encode)
-            decoding = min(cpu(lambda e=encoded: [_decode(data, "") for data in e]) for _ in range(3))
+            decoding = min(cpu(lambda e=encoded: [exr.decode(data, "") for data in e]) for _ in range(3))
             for channels, data in zip(images, encoded, strict=True):
-                back = _decode(data, "")[1]
+                back = exr.decode(data, "")[1]
                 same = (np.array_equal(back[n].view(np.uint8), pixels.view(np.uint8)) for n, pixels in channels.items())
                 assert all(same), f"{name} is not lossless"
             each = 1000 / len(images)

@@ -43,9 +43,12 @@ import psutil
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)] * (str(ROOT) not in sys.path)  # for the system below and in workers
 
-from pipeline import commands, runner  # noqa: E402
+from pipeline import commands, mapping  # noqa: E402
 from pipeline.config import StageConfig, count, parse  # noqa: E402
 from pipeline.hydra_config import compose  # noqa: E402
+from pipeline.keys import digest_of  # noqa: E402
+from pipeline.plan import item_keys, make_plan, split_config  # noqa: E402
+from pipeline.run import run_pipeline  # noqa: E402
 from pipeline.stage import Item, MapStage, Record, System, load_system  # noqa: E402
 from pipeline.store import Artifact, Store  # noqa: E402
 from pipeline.worker import log_file  # noqa: E402
@@ -98,22 +101,22 @@ def config_of(folder: Path, items: int) -> dict[str, Any]:
 
 def fill(folder: Path, items: int, name: str, left: int) -> None:
     """Make the parts of a draft, all but the last, as workers would, without starting any."""
-    run, system, sections = runner.split_config(config_of(folder, items))
+    run, system, sections = split_config(config_of(folder, items))
     store = Store(folder)
-    plan = runner.make_plan(run, system, sections, lambda path: "")
+    plan = make_plan(run, system, sections, lambda path: "")
     planned = plan[name]
     inputs = {parent: store.find(parent, plan[parent].key) for parent in planned.stage.inputs}
     draft = store.draft(name, planned.key, planned.preimage, print, {"system": run.system, "config": {}})
     draft.set_environment({})
     stage = load_system("bench.scale").stage(name)
     listed = sorted(stage.items(planned.config, inputs), key=lambda item: (item.group, item.id))
-    keys = runner.item_keys(planned, listed, inputs)
-    parts = list(runner._parts(listed, keys, stage.part_size(planned.config, inputs)))
+    keys = item_keys(planned, listed, inputs)
+    parts = list(mapping._parts(listed, keys, stage.part_size(planned.config, inputs)))
     for group, indices in parts[: len(parts) - left]:
         writer = draft.open_part()
         for index in indices:
             writer.add(Record(listed[index].id, {"nothing": b""}), listed[index].id, group, keys[index])
-        part_key = runner.digest_of({"group": group, "items": tuple(keys[index] for index in indices)})
+        part_key = digest_of({"group": group, "items": tuple(keys[index] for index in indices)})
         ids = [listed[index].id for index in indices]
         draft.finish_part(part_key, {**writer.close(), "part_key": part_key, "group": group, "items": ids, "rejects": []})
 
@@ -125,14 +128,14 @@ def step(name: str, folder: Path, items: int) -> None:
     if name == "build":
         os.fsync = lambda handle: None  # it is not what is timed
         fill(folder, items, "empty", 0)
-        runner.run_pipeline({**config_of(folder, items), "stage": "empty", "workers": 0}, ["bench"])
+        run_pipeline({**config_of(folder, items), "stage": "empty", "workers": 0}, ["bench"])
         fill(folder, items, "again", LEFT)
     elif name == "ls":
         commands.command_ls(Store(folder), arguments)
     elif name.startswith("verify"):
         assert commands.command_verify(Store(folder), arguments) == 0
     else:
-        runner.run_pipeline({**config_of(folder, items), "workers": 2, "plan": name == "plan"}, ["bench"])
+        run_pipeline({**config_of(folder, items), "workers": 2, "plan": name == "plan"}, ["bench"])
     print(json.dumps({"wall": time.monotonic() - began, "cpu": time.process_time() - before}))
 
 
@@ -230,7 +233,7 @@ class Arrival(NamedTuple):
 def timed_stage(root: dict[str, Any], stage: str, workers: int) -> tuple[float, list[Arrival]]:
     """Compute the stage anew. Seconds of the whole, and its parts as they came in."""
     arrived: list[Arrival] = []
-    run_parts = runner.run_parts
+    run_parts = mapping.run_parts
 
     def noting(tasks: Any, workers: int, threads: int, limits: Any, on_result: Any, log: Any) -> None:
         assert threads == 1
@@ -245,12 +248,12 @@ def timed_stage(root: dict[str, Any], stage: str, workers: int) -> tuple[float, 
 
     kind = type(load_system(root["system"]).stage(stage))
     with (
-        mock.patch.object(runner, "run_parts", noting),
+        mock.patch.object(mapping, "run_parts", noting),
         mock.patch.object(kind, "part_size", lambda self, config, inputs: 1),
         mock.patch("os.cpu_count", lambda: workers),  # from which the runner takes the threads of a worker: one
     ):
         began = time.perf_counter()
-        runner.run_pipeline({**root, "stage": stage, "force": stage, "workers": workers}, ["bench"], lambda text: None)
+        run_pipeline({**root, "stage": stage, "force": stage, "workers": workers}, ["bench"], lambda text: None)
         return time.perf_counter() - began, arrived
 
 
@@ -284,7 +287,7 @@ def bench_workers(work: Path, objects: int, scenes: int) -> None:
         "scene.count.test=2", "render.resolution=64", "render.max_spp=64", "render.target_error=0",
     ]  # fmt: skip
     root = compose(overrides)
-    runner.run_pipeline({**root, "stage": "render"}, ["bench"])  # what both read, and what the machine keeps of a first run
+    run_pipeline({**root, "stage": "render"}, ["bench"])  # what both read, and what the machine keeps of a first run
     print("workers: throughput of two workers over one, one thread each")
     before = loop_ratio()
     rows = []
@@ -364,7 +367,7 @@ def sample_config(store: Path, scenes: int) -> dict[str, Any]:
 
 def make_sample(work: Path, scenes: int) -> Store:
     store = work / "sample"
-    runner.run_pipeline(sample_config(store, scenes), ["bench"])
+    run_pipeline(sample_config(store, scenes), ["bench"])
     return Store(store)
 
 

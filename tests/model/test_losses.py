@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from model.lpips import LPIPS, tone_map
-from model.renderformer.losses import image_loss, log_radiance
+from model.lpips import LPIPS
+from model.renderformer.losses import image_loss, log_radiance, tone_map
 from tests.model.lpips import distance, write_weights
 
 

@@ -6,7 +6,7 @@ import argparse
 
 import pytest
 
-from pipeline import commands, runner
+from pipeline import commands
 from pipeline.errors import ItemsFailed
 from pipeline.repair import repair
 from pipeline.run import run_pipeline
@@ -37,7 +37,12 @@ def run(tmp_path):
 @pytest.fixture
 def code(monkeypatch):
     """code(digest): from here on the stages' code has that digest."""
-    return lambda digest: monkeypatch.setattr(runner, "code_digest", lambda system, name: digest)
+
+    def change(digest: str) -> None:
+        for module in ("make", "run"):
+            monkeypatch.setattr(f"pipeline.{module}.code_digest", lambda system, name: digest)
+
+    return change
 
 
 def notes(lines: list[str]) -> list[str]:

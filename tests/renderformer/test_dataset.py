@@ -11,7 +11,6 @@ import zlib
 
 import numpy as np
 import pytest
-from fakes import sharded
 
 from pipeline.errors import UserError
 from stages.renderformer.dataset import (
@@ -32,6 +31,7 @@ from stages.renderformer.dataset import (
     prefetch,
     rotation_from_vector,
 )
+from tests.renderformer.fakes import sharded
 
 PLAIN = BatchConfig(rotate=False, translate_sigma=0.0, layers=("direct",))
 EVERYTHING = BatchConfig(

@@ -10,12 +10,12 @@ from pathlib import PurePosixPath
 
 import numpy as np
 import pytest
-from fakes import dataset_inputs, with_textures
 
 from stages.graphics.metrics import log_error
 from stages.renderformer.dataset import Sample, decode_sample, expose, make_example, mirror, move, rotation_from_vector
 from stages.renderformer.dataset.encoding import decode_scene, encode_scene
 from stages.renderformer.records import SceneRecord
+from tests.renderformer.fakes import dataset_inputs, with_textures
 
 VIEWS = np.array([0, 2])
 SPP = 256
@@ -139,9 +139,8 @@ def read_released(path) -> dict:
 
 
 def test_an_exported_scene_has_the_same_arrays(tmp_path):
-    from fakes import sharded
-
     from stages.renderformer.dataset.interchange import export
+    from tests.renderformer.fakes import sharded
 
     artifact = sharded(tmp_path, train=2, test=1)[1]
     written = list(export(artifact, tmp_path / "out", ["train"], images=True))
@@ -174,11 +173,10 @@ def test_an_exported_scene_has_the_same_arrays(tmp_path):
 
 def test_export_then_import_renders_the_same_scene(tmp_path):
     """Arrays, cameras and lights come back through the released format, and each light is told apart again."""
-    from fakes import sharded
-
     from pipeline.stage import Item
     from stages.renderformer.dataset.interchange import export
     from stages.renderformer.s03_import import ImportConfig, ImportScene
+    from tests.renderformer.fakes import sharded
 
     artifact = sharded(tmp_path, train=2, test=1)[1]
     list(export(artifact, tmp_path / "out"))

@@ -7,18 +7,18 @@ import shutil
 
 import numpy as np
 import pytest
-from fakes import with_textures
 
 from pipeline.errors import Reject, UserError
 from pipeline.hydra_config import compose
 from pipeline.plan import make_plan, split_config
 from pipeline.run import run_pipeline
 from pipeline.stage import Item
-from pipeline.store import hash_file
+from pipeline.store.files import hash_file
 from stages.cli import main
 from stages.renderformer.records import SceneRecord
 from stages.renderformer.s03_import import ImportConfig, ImportScene
 from stages.renderformer.scenes.released import load_scene
+from tests.renderformer.fakes import with_textures
 
 MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 

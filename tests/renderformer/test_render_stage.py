@@ -6,8 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fakes import FakeArtifact
-from test_rendering import SCALAR, camera, clutter
 
 from pipeline import commands
 from pipeline.errors import Reject, UserError
@@ -20,6 +18,8 @@ from stages.renderformer.rendering import noise, sheet
 from stages.renderformer.rendering.render import render_views
 from stages.renderformer.s04_render import Render, RenderConfig
 from stages.renderformer.views import decode_view, encode_view, view_members
+from tests.renderformer.fakes import FakeArtifact
+from tests.renderformer.test_rendering import SCALAR, camera, clutter
 
 CONFIG = {"resolution": 16, "max_spp": 4, "target_error": 0.0}
 

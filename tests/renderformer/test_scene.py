@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import decimated
 from omegaconf import OmegaConf
 
 from pipeline.config import parse
@@ -20,6 +19,7 @@ from stages.renderformer.s03_scene import SampleScene, SceneConfig
 from stages.renderformer.scenes import meshes
 from stages.renderformer.scenes.assemble import choose_rungs, place
 from stages.renderformer.scenes.laws import TEMPLATES, WALLS, LightLaw, Material, Placement, draw_plan
+from tests.renderformer.fakes import decimated
 
 ROOT = Path(__file__).resolve().parents[2]
 N = 2000
@@ -341,7 +341,7 @@ def test_refusals(made, tmp_path):
 
 
 def test_statistics(made, tmp_path):
-    from fakes import FakeArtifact
+    from tests.renderformer.fakes import FakeArtifact
 
     stage, config, inputs, _, records = made
     draft = FakeArtifact(tmp_path, [(record.id.split("-")[0], record) for record in records])

@@ -17,7 +17,6 @@ import tarfile
 import zipfile
 from pathlib import Path
 
-import fakes
 import numpy as np
 import pytest
 
@@ -25,6 +24,7 @@ from pipeline.errors import Reject, UserError
 from stages.graphics.arrays import unpack_arrays
 from stages.renderformer.dataset.encoding import decode_scene
 from stages.renderformer.scenes.released import load_scene
+from tests.renderformer import fakes
 
 ROOT = Path(__file__).resolve().parents[2]
 CAMERA = {"position": [0, -2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fakes import commit_shards, dataset_inputs, sharded
 
 from pipeline.errors import UserError
 from stages.graphics.arrays import unpack_json
@@ -19,6 +18,7 @@ from stages.renderformer.dataset.encoding import MAX_ERROR, decode_scene, encode
 from stages.renderformer.records import SceneRecord
 from stages.renderformer.s05_shard import Shard, ShardConfig
 from stages.renderformer.views import LAYERS
+from tests.renderformer.fakes import commit_shards, dataset_inputs, sharded
 
 
 @pytest.fixture(scope="module")

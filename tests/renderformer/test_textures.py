@@ -11,10 +11,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from fakes import FakeArtifact, blob, decimated
 from PIL import Image
-from test_collect import CORNERS, FACES, gltf, words
-from test_rendering import SCALAR, backend, build, camera, clutter, hashed, jit, quad  # noqa: F401 (fixtures)
 
 from pipeline.config import parse
 from pipeline.errors import UserError
@@ -30,6 +27,9 @@ from stages.renderformer.s00_collect import Collect, made_up_texture
 from stages.renderformer.s03_scene import SampleScene, SceneConfig, SceneCount
 from stages.renderformer.scenes import textures
 from stages.renderformer.scenes.laws import TextureLaw
+from tests.renderformer.fakes import FakeArtifact, blob, decimated
+from tests.renderformer.test_collect import CORNERS, FACES, gltf, words
+from tests.renderformer.test_rendering import SCALAR, backend, build, camera, clutter, hashed, jit, quad  # noqa: F401 (fixtures)
 
 ROW, COLUMN = np.indices((32, 32))
 FIRST, SECOND = (COLUMN + 0.5) / 32, (ROW + 0.5) / 32  # weights of corners 1 and 2 at the texels' centres

@@ -10,13 +10,13 @@ import sys
 
 import numpy as np
 import pytest
-from fakes import FakeArtifact, sharded
 
 from pipeline.errors import UserError
 from stages.renderformer.dataset import decode_sample
 from stages.renderformer.inference.predict import load_model, predict_scene
 from stages.renderformer.inference.renderer import predict
 from stages.renderformer.s06_train import ModelSection, Train, TrainConfig
+from tests.renderformer.fakes import FakeArtifact, sharded
 
 MODEL = dict(
     name="micro", latent_dim=128, num_layers=1, num_heads=1, dim_feedforward=64, num_register_tokens=2,
