@@ -15,7 +15,7 @@ from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
@@ -72,18 +72,16 @@ def parse_overrides(words: Sequence[str]) -> list[Any]:
     for word in words:
         try:
             overrides.append(parser.parse_override(word))
-        except OverrideParseException as error:
-            raise UserError(_syntax_error(word, error)) from None
         except HydraException as error:
-            raise UserError(f"{word!r} is not an override: {str(error).splitlines()[0]}") from None
+            raise UserError(_syntax_error(word, error)) from None
     return overrides
 
 
-def _syntax_error(word: str, error: OverrideParseException) -> str:
+def _syntax_error(word: str, error: HydraException) -> str:
     name, equals, _ = word.partition("=")
     if not equals and not name.startswith("~"):
         return f"{word!r} is not an override: write name=value"
-    reason = str(error.args[0] if error.args else error).splitlines()[0]
+    reason = str(error).splitlines()[0]
     for opening, closing in ("[]", "{}", "()"):
         if word.count(opening) != word.count(closing):
             return f"{word!r} is not an override: {opening!r} and {closing!r} do not pair ({reason})"

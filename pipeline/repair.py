@@ -108,10 +108,11 @@ def _again(origin: Mapping[str, Any]) -> str:
 def _planned(store: Store, name: str, origin: Mapping[str, Any]) -> Planned:
     """The stage as it was planned; its key must come out as it was."""
     preimage = origin["preimage"]
-    stage = load_system(origin["system"]).stage(preimage["stage"])
+    system = load_system(origin["system"])
+    stage = system.stage(preimage["stage"])
     config = parse(stage.Config, origin["config"], stage.name)
     with hashes_of(store) as hashes:
-        planned = plan_stage(origin["system"], stage, config, preimage["inputs"], hashes)
+        planned = plan_stage(system.name, stage, config, preimage["inputs"], hashes)
     if planned.key != origin["key"]:
         raise UserError(
             f"{name} cannot be repaired part by part: the version of {stage.name} or the source files that it read have "
