@@ -1,4 +1,5 @@
 # make data train eval    the whole line on the embedded default; any combination works
+# make data train eval SYSTEM=NAME    the same of another system
 # make sweep              table 1 of the paper, small: twelve variants over one dataset, and the table
 # make test               the tests
 # Everything installs itself into .venv. All targets are phony: the store decides what is stale.
@@ -9,13 +10,14 @@ TORCH ?= $(shell nvidia-smi >/dev/null 2>&1 && echo cuda || echo cpu)
 TORCH_VERSION := 2.13.0
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 ARGS ?=
+SYSTEM ?= renderformer
 TABLE ?= table1_small
 
 VENV := .venv
 RUN := $(VENV)/bin/python
 READY := $(VENV)/ready-$(TORCH)
 
-PROBES := $(basename $(notdir $(wildcard conf/probe/*.yaml)))
+PROBES := $(basename $(notdir $(wildcard conf/renderformer/probe/*.yaml)))
 EMPTY :=
 COMMA := ,
 
@@ -24,16 +26,13 @@ COMMA := ,
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make data      meshes -> shards   (stages collect remesh decimate scene render shard)"
-	@echo "make train     shards -> a trained model"
-	@echo "make eval      model and held-out shards -> an HTML report"
-	@echo "make probes    all probes of the model, each a figure and a table (docs/probes.md)"
-	@echo "make sweep     table 1 of the paper at small size: twelve variants, one dataset, runs/table1_small/table.md"
+	@test ! -f conf/$(SYSTEM)/help.txt || cat conf/$(SYSTEM)/help.txt
+	@echo
 	@echo "make test      the tests          (TESTS=tests/model for some of them)"
 	@echo "make lint      ruff"
 	@echo "make setup     only create $(VENV) and install what is missing"
 	@echo
-	@echo "ARGS='...' passes Hydra overrides on:  make data ARGS='collect=folder collect.path=meshes'"
+	@echo "SYSTEM=NAME chooses the system (here: $(SYSTEM)), ARGS='...' passes Hydra overrides on"
 	@echo "TORCH=cpu|cuda chooses the torch build (here: $(TORCH)); PYTHON=python3.12 the interpreter"
 
 setup: $(READY)
@@ -56,14 +55,8 @@ endif
 		{ echo "error: pymeshlab needs system libraries: apt-get install libgl1 libopengl0"; exit 2; }
 	@rm -f $(VENV)/ready-* && touch $@
 
-data: setup
-	@$(RUN) -m pipeline stage=shard $(ARGS)
-
-train: setup
-	@$(RUN) -m pipeline stage=train $(ARGS)
-
-eval: setup
-	@$(RUN) -m pipeline stage=evaluate $(ARGS)
+data train eval: setup
+	@$(RUN) -m pipeline system=$(SYSTEM) stage=$@ $(ARGS)
 
 probes: setup
 	@$(RUN) -m pipeline stage=probe probe=$(subst $(EMPTY) $(EMPTY),$(COMMA),$(PROBES)) -m $(ARGS)

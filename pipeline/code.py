@@ -1,12 +1,13 @@
 """What code made an artifact: a digest of the stage's syntax tree and of the project modules it imports, and the commit.
 
 Code is not in a key: a stage's ``version`` is. The digest catches the author who changed the output and forgot the version
-(tests/renderformer/versions.json holds the pairs). Comments, docstrings and formatting change nothing.
+(tests/<system>/versions.json holds the pairs). Comments, docstrings and formatting change nothing.
 """
 
 from __future__ import annotations
 
 import ast
+import importlib.util
 import subprocess
 from functools import cache
 from pathlib import Path
@@ -15,15 +16,27 @@ from pipeline.keys import blake
 from pipeline.stage import System
 
 ROOT = Path(__file__).resolve().parents[1]
-ENGINE = "pipeline"  # the engine decides where and when a stage runs, never what comes out
+ENGINE = "pipeline"  # the engine decides where and when a stage runs, never what comes out; but for one function:
+SEEDS = "pipeline.keys.seed_for"
 
 
-def _module_file(name: str) -> Path | None:
-    base = ROOT.joinpath(*name.split("."))
-    for path in (base.with_suffix(".py"), base / "__init__.py"):
-        if path.is_file():
-            return path
+def _module_file(name: str, roots: tuple[Path, ...] = (ROOT,)) -> Path | None:
+    """The file of a module below one of the folders; None for modules of libraries."""
+    for root in roots:
+        base = root.joinpath(*name.split("."))
+        for path in (base.with_suffix(".py"), base / "__init__.py"):
+            if path.is_file():
+                return path
     return None
+
+
+def _roots(module: str) -> tuple[Path, ...]:
+    """The project, and the folder that the module is imported from, which may lie elsewhere."""
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        return (ROOT,)
+    depth = module.count(".") + (Path(spec.origin).name == "__init__.py")
+    return (ROOT, Path(spec.origin).resolve().parents[depth])
 
 
 @cache
@@ -39,13 +52,13 @@ def _tree(path: Path) -> ast.Module:
     return tree
 
 
-def imported_modules(name: str) -> set[str]:
+def imported_modules(name: str, roots: tuple[Path, ...] = (ROOT,)) -> set[str]:
     """Project modules (not the engine's) that ``name`` imports anywhere in it, functions included, and theirs in turn."""
     found: set[str] = set()
     todo = [name]
     while todo:
         module = todo.pop()
-        path = _module_file(module)
+        path = _module_file(module, roots)
         if path is None or module in found or module.split(".")[0] == ENGINE:
             continue
         found.add(module)
@@ -63,13 +76,20 @@ def imported_modules(name: str) -> set[str]:
 
 
 def code_digest(system: System, stage: str) -> str:
-    """Hex digest of the syntax trees behind a stage."""
-    parts = []
-    for imported in sorted(imported_modules(system.modules[stage].partition(":")[0])):
-        path = _module_file(imported)
+    """Hex digest of the syntax trees behind a stage: its project modules, and what seeds every random number."""
+    module = system.modules[stage].partition(":")[0]
+    roots = _roots(module)
+    parts = [SEEDS + "\n" + ast.dump(_function(ROOT.joinpath(*SEEDS.split(".")[:-1]).with_suffix(".py"), SEEDS.split(".")[-1]))]
+    for imported in sorted(imported_modules(module, roots)):
+        path = _module_file(imported, roots)
         assert path is not None
         parts.append(imported + "\n" + ast.dump(_tree(path)))
     return blake("\n".join(parts).encode())
+
+
+def _function(path: Path, name: str) -> ast.AST:
+    """The function's syntax tree."""
+    return next(node for node in _tree(path).body if isinstance(node, ast.FunctionDef) and node.name == name)
 
 
 @cache

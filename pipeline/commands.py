@@ -14,11 +14,11 @@ from typing import Any
 
 from pipeline.errors import Damaged, UserError
 from pipeline.hydra_config import compose
-from pipeline.plan import make_plan, split_config
+from pipeline.plan import hashes_of, make_plan, split_config
 from pipeline.progress import duration
 from pipeline.repair import repair
 from pipeline.status import lines, read_states
-from pipeline.store import Artifact, HashCache, Store, iter_inputs
+from pipeline.store import Artifact, Store, iter_inputs
 
 
 def size(count: float) -> str:
@@ -55,25 +55,33 @@ def _short(value: Any) -> str:
     return text[:12] if len(text) == 64 and all(c in "0123456789abcdef" for c in text) else text
 
 
+def _places(store: Store, reference: str | None) -> list[str | None]:
+    """The places that a person names by a stage or a system; [None], all of them, where nothing is named."""
+    return [None] if reference is None else [*store.places(reference)] or [reference]
+
+
 def command_ls(store: Store, arguments: argparse.Namespace) -> int:
-    artifacts = store.artifacts(arguments.stage)
+    places = _places(store, arguments.stage)
+    artifacts = [artifact for where in places for artifact in store.artifacts(where)]
     for artifact in artifacts:
         outputs = artifact.manifest["outputs"]
         age = duration(time.time() - artifact.manifest["finished"])
         pin = "pinned" if store.pinned(artifact.key) else ""
         rejects = sum(outputs["rejects"].values())
-        name = f"{artifact.stage}/{artifact.path.name}"
+        name = artifact.name
         print(f"{name:<44} {outputs['records']:>7} records {rejects:>5} rejected {size(outputs['bytes']):>8}  {age} ago  {pin}")
     for path in store.drafts():
-        if arguments.stage in (None, path.parent.name):
-            holder = store.claim(path.parent.name, path.name.removesuffix(".partial")).holder()
+        where = store.place_of(path)
+        if None in places or where in places:
+            holder = store.claim(where, path.name.removesuffix(".partial")).holder()
             state = f"in the making by process {holder['pid']} on {holder['host']}" if holder else "unfinished"
             parts = len(list((path / "markers").glob("*.json")))
-            print(f"{path.parent.name}/{path.name[:12]}.partial  {parts} parts, {state}")
+            print(f"{where}/{path.name[:12]}.partial  {parts} parts, {state}")
     readable = {artifact.path for artifact in artifacts}
-    for path in store.folders(arguments.stage):
+    for path in (path for where in places for path in store.folders(where)):
         if path not in readable:
-            print(f"{path.parent.name}/{path.name:<30} damaged: `lightmill verify` says how, `lightmill repair` makes it anew")
+            name = f"{store.place_of(path)}/{path.name:<30}"
+            print(f"{name} damaged: `lightmill verify` says how, `lightmill repair` makes it anew")
     if not artifacts:
         print(f"no artifacts in {store.root}")
     return 0
@@ -83,7 +91,7 @@ def command_show(store: Store, arguments: argparse.Namespace) -> int:
     artifact = store.resolve(arguments.artifact)
     manifest = artifact.manifest
     outputs = manifest["outputs"]
-    print(f"{artifact.stage}/{artifact.path.name}")
+    print(artifact.name)
     print(f"  path      {artifact.path}")
     print(f"  key       {artifact.key}{'  (pinned)' if store.pinned(artifact.key) else ''}")
     print(f"  digest    {artifact.digest}")
@@ -139,7 +147,8 @@ def _natural(name: str) -> list[tuple[bool, int, str]]:
 def _lineage(store: Store, artifact: Artifact, indent: str, seen: set[str]) -> None:
     for name, key, parent in iter_inputs(store, artifact):
         again = " (above)" if key in seen and parent is not None else ""
-        print(f"{indent}{name}/{parent.path.name if parent else key[:12] + ' (gone)'}{again}")
+        what = parent.name if parent is not None else f"{name}/{key[:12]} (gone)"
+        print(f"{indent}{what}{again}")
         if parent is not None and not again:
             seen.add(key)
             _lineage(store, parent, indent + "  ", seen)
@@ -155,20 +164,21 @@ def command_why(store: Store, arguments: argparse.Namespace) -> int:
         _explain(store, old.manifest["preimage"], new.manifest["preimage"], "", lambda key: _preimage(store, key))
         return 0
     run, system, sections = split_config(compose([f"stage={first}", *rest]))
-    plan = make_plan(run, system, sections, HashCache(store.root / ".cache" / "hashes.json"))
+    with hashes_of(store) as hashes:
+        plan = make_plan(run, system, sections, hashes)
     by_key = {planned.key: planned.preimage for planned in plan.values()}
     for name, planned in plan.items():
-        artifact = store.find(name, planned.key)
+        artifact = store.find(planned.place, planned.key)
         if artifact is not None:
-            print(f"{name}: up to date, {artifact.stage}/{artifact.path.name}")
+            print(f"{name}: up to date, {artifact.name}")
             continue
-        others = store.artifacts(name)
+        others = store.artifacts(planned.place)
         if not others:
             print(f"{name}: to make, there is no {name} artifact in {store.root}")
             continue
         # the nearest: fewest differing leaves, the newest among equals
         near = min(reversed(others), key=lambda a: len(difference(a.manifest["preimage"], planned.preimage)))
-        print(f"{name}: to make; against {name}/{near.path.name}:")
+        print(f"{name}: to make; against {near.name}:")
         _explain(
             store,
             near.manifest["preimage"],
@@ -180,8 +190,8 @@ def command_why(store: Store, arguments: argparse.Namespace) -> int:
 
 
 def _preimage(store: Store, key: str) -> Mapping[str, Any] | None:
-    found = [artifact for artifact in store.artifacts() if artifact.key == key]
-    return found[0].manifest["preimage"] if found else None
+    artifact = store.by_key(key)
+    return artifact.manifest["preimage"] if artifact is not None else None
 
 
 def _explain(
@@ -207,7 +217,7 @@ def _explain(
 
 
 def command_status(store: Store, arguments: argparse.Namespace) -> int:
-    states = read_states(store, arguments.stage)
+    states = [state for where in _places(store, arguments.stage) for state in read_states(store, where)]
     if arguments.json:
         print(json.dumps(states, indent=1))
         return 0
@@ -227,7 +237,7 @@ def command_verify(store: Store, arguments: argparse.Namespace) -> int:
     for artifact in artifacts:
         problems = artifact.verify(deep=arguments.deep)
         bad += bool(problems)
-        name = f"{artifact.path.parent.name}/{artifact.path.name}"
+        name = artifact.name
         print(f"{name}: {'sound' if not problems else f'{len(problems)} problem(s); lightmill repair {name} makes it anew'}")
         for problem in problems:
             print(f"  {problem}")
@@ -270,7 +280,7 @@ def _bytes(folder: Path) -> int:
 def command_pin(store: Store, arguments: argparse.Namespace) -> int:
     artifact = store.resolve(arguments.artifact)
     store.pin(artifact.key, not arguments.remove)
-    print(f"{artifact.stage}/{artifact.path.name} {'no longer pinned' if arguments.remove else 'pinned: gc keeps it'}")
+    print(f"{artifact.name} {'no longer pinned' if arguments.remove else 'pinned: gc keeps it'}")
     return 0
 
 
@@ -289,9 +299,9 @@ def add_commands(parsers: Any, program: str) -> None:
         return parser
 
     parser = add("ls", command_ls, "list artifacts and unfinished work", "render")
-    parser.add_argument("stage", nargs="?", help="only this stage")
+    parser.add_argument("stage", nargs="?", help="only this stage or system: STAGE, SYSTEM or SYSTEM/STAGE")
     parser = add("status", command_status, "what runs, how far it is, what failed; and what was left unfinished", "")
-    parser.add_argument("stage", nargs="?", help="only this stage")
+    parser.add_argument("stage", nargs="?", help="only this stage or system: STAGE, SYSTEM or SYSTEM/STAGE")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser = add("show", command_show, "show one artifact: config, counts, rejects, summary, lineage", "render")
     parser.add_argument("artifact", help="a key or its beginning, stage/folder, or a stage's name for its newest")

@@ -31,6 +31,11 @@ def count(default: Any = ..., **kwargs: Any) -> Any:
     return Field(default, json_schema_extra={"count": True}, **kwargs)
 
 
+def report(default: Any = ..., **kwargs: Any) -> Any:
+    """A field that decides only files which ``finish`` makes: a change makes those anew, and takes every item over."""
+    return Field(default, json_schema_extra={"report": True}, **kwargs)
+
+
 class Section(BaseModel):
     """Base of every config model: frozen, no unknown fields, no NaN."""
 

@@ -1,22 +1,55 @@
-"""Hydra at the boundary: compose YAML and overrides into plain containers, and explain a bad override."""
+"""Hydra at the boundary: compose YAML and overrides into plain containers, and explain a bad override.
+
+The word ``system=NAME`` is read before Hydra composes: it chooses the folder whose ``config.yaml`` is composed. Groups that all
+systems share (``executor``, ``hydra/launcher``) and ``engine.yaml`` are found beside the systems' folders, in ``CONF``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from pipeline.config import nearest
 from pipeline.errors import UserError
+from pipeline.stage import System, load_system
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
+DEFAULT_SYSTEM = "renderformer"
+SYSTEM_WORD = "system="
+
+
+def system_of(overrides: Sequence[str]) -> System:
+    """The system that the last ``system=NAME`` of the overrides names, or the default one."""
+    names = [word.removeprefix(SYSTEM_WORD) for word in overrides if word.startswith(SYSTEM_WORD)]
+    return load_system(names[-1] if names else DEFAULT_SYSTEM)
+
+
+def config_folder(system: System) -> Path:
+    """The folder of the system's ``config.yaml``: ``conf/NAME``, or the folder ``conf`` beside its module."""
+    for folder in (CONF / system.name, system.folder / "conf"):
+        if (folder / "config.yaml").is_file():
+            return folder
+    raise UserError(
+        f"system={system.name} has no config.yaml: put one in conf/{system.name}, or in the folder conf beside its module"
+    )
+
+
+@contextmanager
+def initialized(system: System) -> Iterator[list[str]]:
+    """Hydra, set to the system's folder; gives the words that a composition needs besides its own overrides."""
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(config_folder(system)), version_base="1.3"):
+        yield [f"hydra.searchpath=[file://{CONF}]"]
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:
@@ -32,15 +65,40 @@ def to_plain(config: DictConfig) -> dict[str, Any]:
     return plain
 
 
+def parse_overrides(words: Sequence[str]) -> list[Any]:
+    """The words as Hydra's overrides. A UserError names the word with a mistake, and the place in it."""
+    parser = OverridesParser.create()
+    overrides = []
+    for word in words:
+        try:
+            overrides.append(parser.parse_override(word))
+        except HydraException as error:
+            raise UserError(_syntax_error(word, error)) from None
+    return overrides
+
+
+def _syntax_error(word: str, error: HydraException) -> str:
+    name, equals, _ = word.partition("=")
+    if not equals and not name.startswith("~"):
+        return f"{word!r} is not an override: write name=value"
+    reason = str(error).splitlines()[0]
+    for opening, closing in ("[]", "{}", "()"):
+        if word.count(opening) != word.count(closing):
+            return f"{word!r} is not an override: {opening!r} and {closing!r} do not pair ({reason})"
+    if word.rstrip().endswith(","):
+        return f"{word!r} is not an override: nothing follows the comma at its end"
+    return f"{word!r} is not an override: {reason}"
+
+
 def compose(overrides: Sequence[str]) -> dict[str, Any]:
     """The config for ``overrides``; a UserError names what does not fit and the nearest right key or choice."""
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = hydra_compose("config", overrides=list(overrides))
-            return to_plain(config)
-    except HydraException as error:
-        raise UserError(_explain(str(error), overrides)) from None
+    parse_overrides(overrides)
+    system = system_of(overrides)
+    with initialized(system) as more:
+        try:
+            return to_plain(hydra_compose("config", overrides=[*overrides, *more]))
+        except HydraException as error:
+            raise UserError(_explain(str(error), overrides, system, more)) from None
 
 
 def _leaves(value: Any, path: str) -> list[str]:
@@ -49,34 +107,37 @@ def _leaves(value: Any, path: str) -> list[str]:
     return []
 
 
-def _explain(message: str, overrides: Sequence[str]) -> str:
+def _explain(message: str, overrides: Sequence[str], system: System, more: Sequence[str]) -> str:
+    """What is wrong with the first override that does not fit; ``message`` is Hydra's own."""
     first = message.splitlines()[0]
+    folders = [config_folder(system), CONF]
     try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            groups = [word for word in overrides if "=" in word and "." not in word.partition("=")[0]]
-            good = []
-            for word in groups:  # groups that exist decide which keys are known (collect=folder has a path)
-                try:
-                    hydra_compose("config", overrides=[*good, word])
-                    good.append(word)
-                except HydraException:
-                    pass
-            known = OmegaConf.to_container(hydra_compose("config", overrides=good), resolve=False)
+        groups = [word for word in overrides if "=" in word and "." not in word.partition("=")[0]]
+        good: list[str] = []
+        for word in groups:  # groups that exist decide which keys are known (collect=folder has a path)
+            try:
+                hydra_compose("config", overrides=[*good, word, *more])
+                good.append(word)
+            except HydraException:
+                pass
+        known = OmegaConf.to_container(hydra_compose("config", overrides=[*good, *more]), resolve=False)
     except HydraException:
         return first
     names = _leaves(known, "")
     for word in overrides:
-        name, equals, _ = word.partition("=")
+        name, equals, value = word.partition("=")
         bare = name.lstrip("+~")
+        if bare.startswith(("hydra.", "hydra/")):
+            continue
         if not equals and not name.startswith("~"):
             return f"{word!r} is not an override: write name=value"
-        if name == bare and bare not in names and not (CONF / bare).is_dir():
+        group = next((folder / bare for folder in folders if (folder / bare).is_dir()), None)
+        if name == bare and bare not in names and group is None:
             return (
                 f"{bare} is unknown{nearest(bare, names) if '.' in bare else nearest(bare, [n for n in names if '.' not in n])}"
             )
-        if (CONF / bare).is_dir():
-            choices = sorted(path.relative_to(CONF / bare).with_suffix("").as_posix() for path in (CONF / bare).rglob("*.yaml"))
-            value = word.partition("=")[2]
+        if group is not None:
+            choices = sorted(path.relative_to(group).with_suffix("").as_posix() for path in group.rglob("*.yaml"))
             if value not in choices and "," not in value:
                 return f"{bare}={value} is unknown{nearest(value, choices)}"
     return first

@@ -1,6 +1,7 @@
 """Keys: what an artifact *is*, as a hash known before anything runs.
 
-key = blake2b-256 of canonical JSON {scheme, stage, version, params, inputs: {name: key}}. Inputs enter by key, not by
+key = blake2b-256 of canonical JSON {scheme, system, stage, version, params, inputs: {role: key}}; the legacy system is left
+out. Inputs enter by key, not by
 content, so plans and sweeps know every key up front and nothing relies on bit-reproducible GPUs.
 """
 
@@ -14,6 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+LEGACY_SYSTEM = "renderformer"  # of artifacts whose preimage names no system: its keys are older than systems
 SCHEME = 1  # bump when the meaning of a key's preimage changes
 _encode = json.JSONEncoder(sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode
 

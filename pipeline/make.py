@@ -44,7 +44,7 @@ def machine_rejects(artifact: Artifact | None) -> list[dict[str, Any]]:
 
 def describe(artifact: Artifact) -> str:
     outputs = artifact.manifest["outputs"]
-    text = f"{artifact.stage}/{artifact.path.name}"
+    text = artifact.name
     if outputs["items"]:
         rejects = sum(outputs["rejects"].values())
         text += f"  {outputs['records']} records" + (f", {rejects} rejected" if rejects else "")
@@ -66,8 +66,8 @@ def make_artifact(
     """Compute one artifact and commit it. ``plan``: the whole run's stages, for its state; ``adopt`` fills a repair's draft."""
     name, key = planned.name, planned.key
     forced, retried = name in run.force, name in run.retry
-    claim = store.claim(name, key)
-    draft_path = store.draft_path(name, key)
+    claim = store.claim(planned.place, key)
+    draft_path = store.draft_path(planned.place, key)
     state: RunState | None = None
     began = time.monotonic()
     try:
@@ -83,11 +83,11 @@ def make_artifact(
         origin = {"system": run.system, "config": planned.config.model_dump(mode="json")}
         code = code_digest(system, name)
         purpose = "repair" if adopt is not None else "force" if forced else "make"
-        draft = store.draft(name, key, planned.preimage, say, origin, purpose, code)
+        draft = store.draft(planned.place, key, planned.preimage, say, origin, purpose, code)
         draft.sweep()
         state = RunState(draft.path, command=shlex.join(command), plan=list(plan))
         started = time.time()
-        old_digest = _digest_of(store, name, key)
+        old_digest = _digest_of(store, planned.place, key)
         if adopt is not None:
             adopt(draft)
         if made is not None and draft.environment() is None:
@@ -126,7 +126,7 @@ def make_artifact(
         artifact = store.commit(draft, planned.stage.slug(planned.config), manifest, replace=forced or retried)
     except BaseException as error:
         if not (draft_path / DRAFT).exists() and isinstance(error, Exception) and not (forced or retried):
-            made = store.find(name, key)
+            made = store.find(planned.place, key)
             if made is not None:  # another process took the claim from us, and was faster
                 shutil.rmtree(draft_path, ignore_errors=True)
                 out(f"{label(system, name)} done       {describe(made)}  by another process meanwhile")
@@ -166,7 +166,7 @@ def _take(claim: Claim, store: Store, planned: Planned, forced: bool, say: Calla
             say(f"waiting: process {holder['pid']} on {holder['host']} is making {planned.key[:12]}")
             told = True
         time.sleep(0.5)
-    return None if forced else store.find(planned.name, planned.key)
+    return None if forced else store.find(planned.place, planned.key)
 
 
 def _digest_of(store: Store, stage: str, key: str) -> str | None:

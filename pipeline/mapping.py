@@ -192,7 +192,7 @@ def _donations(
     found: dict[str, Reuse] = {}
     codes: dict[Path | None, list[str]] = {None: []}
     wanted: set[str] = set()
-    for artifact in store.artifacts(planned.name):
+    for artifact in store.artifacts(planned.place):
         manifest = artifact.manifest
         if manifest["base_key"] != base or manifest["environment"] != environment:
             continue

@@ -13,20 +13,20 @@ from pipeline.config import Section, StageConfig, nearest, parse
 from pipeline.errors import (
     UserError,
 )
-from pipeline.keys import SCHEME, canonical, digest_of, digest_of_plain
+from pipeline.keys import LEGACY_SYSTEM, SCHEME, canonical, digest_of, digest_of_plain
 from pipeline.stage import Item, Stage, System, load_system
-from pipeline.store import Artifact
+from pipeline.store import Artifact, HashCache, Store, place
 
 
 class RunConfig(Section):
     """The engine's own part of the config; everything here is outside keys."""
 
-    system: str = "renderformer"
-    stage: tuple[str, ...] = Field(min_length=1)  # what to make; what it reads is made first where it is missing
+    system: str = LEGACY_SYSTEM
+    stage: tuple[str, ...] = Field(min_length=1)  # what to make, stages or targets; what they read comes first
     seed: int = 0  # stages that draw random numbers refer to it
     store: str = "store"
     force: tuple[str, ...] = ()  # stages to compute again although their artifacts exist
-    retry: tuple[str, ...] = ()  # stages of whose artifacts only what a crash or a limit rejected is computed again
+    retry: tuple[str, ...] = ()  # stages to run again for the items that crashed or hit a limit
     plan: bool = False  # print the plan and stop
     workers: int | Literal["auto"] = Field("auto")  # worker processes; auto: one per core; 0: none, in this process
     jobs: int | None = Field(None, ge=1)  # of a sweep at a time, each in a process of its own; None: one by one in this one
@@ -49,6 +49,8 @@ def split_config(root: Mapping[str, Any]) -> tuple[RunConfig, System, dict[str, 
     for name in root:
         if name not in known:
             raise UserError(f"{name} is unknown{nearest(name, known)}")
+    stages = [stage for name in run.stage for stage in system.targets.get(name, (name,))]
+    run = run.model_copy(update={"stage": tuple(dict.fromkeys(stages))})
     for name in (*run.stage, *run.force, *run.retry):
         system.stage(name)
     return run, system, {name: root[name] for name in root if name in system.modules}
@@ -64,23 +66,51 @@ class Planned:
     key: str
     preimage: Mapping[str, Any]
 
+    @property
+    def place(self) -> str:
+        """The folder of the store where such artifacts lie (``pipeline.store.place``)."""
+        return place(self.preimage)
+
+    def inputs(self, artifacts: Mapping[str, Any]) -> dict[str, Any]:
+        """Role -> what ``artifacts`` holds for the stage that plays it."""
+        roles = self.stage.roles()
+        return {role: artifacts[roles[role]] for role in self.stage.reads(self.config)}
+
 
 def make_plan(
     run: RunConfig, system: System, sections: Mapping[str, Any], hash_file: Callable[[Any], str]
 ) -> dict[str, Planned]:
-    """Name -> planned stage, in running order. Every key is known here, before anything runs."""
+    """Stage name -> planned stage, each after what it reads. Every key is known here, before anything runs."""
     plan: dict[str, Planned] = {}
-    for name in system.upstream(run.stage):
+
+    def visit(name: str, path: tuple[str, ...]) -> None:
+        if name in path:
+            raise AssertionError(f"stages form a cycle: {' -> '.join((*path, name))}")
+        if name in plan:
+            return
         stage = system.stage(name)
         if name not in sections:
             raise UserError(f"the config has no section {name!r} for the stage of that name")
         config = parse(stage.Config, sections[name], name)
-        plan[name] = plan_stage(stage, config, {parent: plan[parent].key for parent in stage.reads(config)}, hash_file)
+        roles = stage.roles()
+        inputs = {role: roles[role] for role in stage.reads(config)}
+        for parent in inputs.values():
+            visit(parent, (*path, name))
+        keys = {role: plan[parent].key for role, parent in inputs.items()}
+        plan[name] = plan_stage(system.name, stage, config, keys, hash_file)
+
+    for name in run.stage:
+        visit(name, ())
+    configs = {name: planned.config for name, planned in plan.items()}
+    for planned in plan.values():
+        planned.stage.agree(planned.config, configs)
     return plan
 
 
-def plan_stage(stage: Stage, config: StageConfig, inputs: Mapping[str, str], hash_file: Callable[[Any], str]) -> Planned:
-    """The stage with this config and input keys, and with the key that they give."""
+def plan_stage(
+    system: str, stage: Stage, config: StageConfig, inputs: Mapping[str, str], hash_file: Callable[[Any], str]
+) -> Planned:
+    """The stage of the system with this config and these input keys by role, and with the key that they give."""
     params = canonical(config, stage.name)
     identity = stage.identity(config, hash_file)
     if identity:
@@ -88,30 +118,36 @@ def plan_stage(stage: Stage, config: StageConfig, inputs: Mapping[str, str], has
     preimage = {
         "scheme": SCHEME, "stage": stage.name, "version": stage.version, "params": params, "inputs": dict(inputs),
     }  # fmt: skip
+    if system != LEGACY_SYSTEM:
+        preimage["system"] = system
     return Planned(stage.name, stage, config, digest_of(preimage), preimage)
 
 
-def without_counts(config: BaseModel, params: Mapping[str, Any]) -> dict[str, Any]:
-    """``params`` less the fields that only say how many items there are (``pipeline.config.count``)."""
-    fields = type(config).model_fields
-    counts = {
-        name
-        for name, field in fields.items()
-        if isinstance(field.json_schema_extra, dict) and field.json_schema_extra.get("count")
-    }
-    return {name: value for name, value in params.items() if name not in counts}
+def hashes_of(store: Store) -> HashCache:
+    """The store's memory of source files' hashes; as a context it is saved at the end."""
+    return HashCache(store.root / ".cache" / "hashes.json")
+
+
+def identity_params(config: BaseModel, params: Mapping[str, Any]) -> dict[str, Any]:
+    """``params`` without what no item depends on: how many items there are, and what only ``finish`` reads.
+
+    Those are the fields of ``pipeline.config.count`` and ``pipeline.config.report``.
+    """
+    extras = {name: field.json_schema_extra for name, field in type(config).model_fields.items()}
+    apart = {name for name, extra in extras.items() if isinstance(extra, dict) and (extra.get("count") or extra.get("report"))}
+    return {name: value for name, value in params.items() if name not in apart}
 
 
 def base_key(planned: Planned) -> str:
     """What an item of the stage is, apart from its id and its inputs: shared by artifacts that differ only in items."""
-    params = without_counts(planned.config, planned.preimage["params"])
+    params = identity_params(planned.config, planned.preimage["params"])
     if "identity" in params:
         params["identity"] = {name: value for name, value in params["identity"].items() if name != "items"}
     return digest_of({**planned.preimage, "params": params, "inputs": {}})
 
 
 def item_keys(planned: Planned, items: Sequence[Item], inputs: Mapping[str, Artifact]) -> list[str]:
-    """One key per item: the stage without counts, the item's id and source, the digests of the records that it needs."""
+    """One key per item: the stage's identity, the item's id and source, the digests of the records that it needs."""
     base = base_key(planned)
     sources = planned.preimage["params"].get("identity", {}).get("items", {})
     whole = {name: artifact.key for name, artifact in inputs.items()}
@@ -125,4 +161,5 @@ def item_keys(planned: Planned, items: Sequence[Item], inputs: Mapping[str, Arti
 
 
 def label(system: System, name: str) -> str:
+    """How a run's lines begin: the stage's number and name."""
     return f"{system.number(name):02} {name:<10}"

@@ -21,15 +21,15 @@ from pipeline.config import parse
 from pipeline.errors import Damaged, UserError
 from pipeline.keys import digest_of
 from pipeline.make import make_artifact
-from pipeline.plan import Planned, RunConfig, plan_stage
+from pipeline.plan import Planned, RunConfig, hashes_of, plan_stage
 from pipeline.stage import MapStage, load_system
-from pipeline.store import UNKNOWN, Artifact, Draft, HashCache, Row, Store, is_sound, read_draft, record_digest
+from pipeline.store import UNKNOWN, Artifact, Draft, Row, Store, is_sound, read_draft, record_digest
 from pipeline.worker import log_file
 
 
 def repair(store: Store, artifact: Artifact, workers: int | None = None, out: Callable[[str], None] = print) -> Artifact:
     """Compute the damaged parts of the artifact anew and swap the mended one in; returns it."""
-    name = f"{artifact.path.parent.name}/{artifact.path.name}"
+    name = artifact.name
     problems = artifact.verify(deep=True)
     if not problems:
         out(f"{name}: sound, nothing to repair")
@@ -47,7 +47,7 @@ def repair(store: Store, artifact: Artifact, workers: int | None = None, out: Ca
     planned = _planned(store, name, origin)
     inputs = {}
     for parent, key in origin["preimage"]["inputs"].items():
-        inputs[parent] = store.find(parent, key)
+        inputs[parent] = store.by_key(key)
         if inputs[parent] is None:
             raise UserError(
                 f"{name} was made from {parent} {key[:12]}, which is gone: make that first, or compute {_again(origin)}"
@@ -108,9 +108,11 @@ def _again(origin: Mapping[str, Any]) -> str:
 def _planned(store: Store, name: str, origin: Mapping[str, Any]) -> Planned:
     """The stage as it was planned; its key must come out as it was."""
     preimage = origin["preimage"]
-    stage = load_system(origin["system"]).stage(preimage["stage"])
+    system = load_system(origin["system"])
+    stage = system.stage(preimage["stage"])
     config = parse(stage.Config, origin["config"], stage.name)
-    planned = plan_stage(stage, config, preimage["inputs"], HashCache(store.root / ".cache" / "hashes.json"))
+    with hashes_of(store) as hashes:
+        planned = plan_stage(system.name, stage, config, preimage["inputs"], hashes)
     if planned.key != origin["key"]:
         raise UserError(
             f"{name} cannot be repaired part by part: the version of {stage.name} or the source files that it read have "

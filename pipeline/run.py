@@ -17,9 +17,9 @@ from pipeline.errors import (
     UserError,
 )
 from pipeline.make import describe, machine_rejects, make_artifact
-from pipeline.plan import Planned, RunConfig, label, make_plan, split_config
+from pipeline.plan import Planned, RunConfig, hashes_of, label, make_plan, split_config
 from pipeline.stage import RunStage
-from pipeline.store import Artifact, HashCache, Store
+from pipeline.store import Artifact, Store
 
 
 def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[[str], None] = print) -> dict[str, Any]:
@@ -29,9 +29,8 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
     """
     run, system, sections = split_config(root)
     store = Store(run.store)
-    hashes = HashCache(store.root / ".cache" / "hashes.json")
-    plan = make_plan(run, system, sections, hashes)
-    hashes.save()
+    with hashes_of(store) as hashes:
+        plan = make_plan(run, system, sections, hashes)
     for setting, names in (("force", run.force), ("retry", run.retry)):
         for name in names:
             if name not in plan:
@@ -40,7 +39,7 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
     damaged: dict[str, Damaged] = {}
     for name, planned in plan.items():
         try:
-            artifacts[name] = store.find(name, planned.key)
+            artifacts[name] = store.find(planned.place, planned.key)
             if artifacts[name] is not None and not run.plan:
                 store.touch(planned.key)  # not only at its turn, which may be days away: gc must know
         except Damaged as error:
@@ -63,7 +62,7 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
                     for line in planned.stage.estimate(planned.config, {other: plan[other].config for other in plan}):
                         out(f"      {line}")
                 else:
-                    inputs = {parent: artifacts[parent] for parent in planned.stage.reads(planned.config)}
+                    inputs = planned.inputs(artifacts)
                     assert all(inputs.values())
                     rest = [other for other in plan if other in todo]
                     artifacts[name] = make_artifact(run, system, planned, inputs, store, command, out, rest, cluster)  # type: ignore[arg-type]
@@ -87,14 +86,16 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
 def _follow(plan: Mapping[str, Planned], todo: set[str], store: Store) -> dict[str, Any]:
     """What a process does that another one leads: its part of run stages, once what they read has been made."""
 
-    def made(name: str) -> Artifact:
-        while (artifact := store.find(name, plan[name].key)) is None:
+    def wait_for(name: str) -> Artifact:
+        while (artifact := store.find(plan[name].place, plan[name].key)) is None:
             time.sleep(0.5)
         return artifact
 
+    stages = {name: name for name in plan}
     for name, planned in plan.items():
         if name in todo and isinstance(planned.stage, RunStage):
-            planned.stage.follow(planned.config, {parent: made(parent) for parent in planned.stage.inputs})
+            inputs = {role: wait_for(parent) for role, parent in planned.inputs(stages).items()}
+            planned.stage.follow(planned.config, inputs)
     return {"artifacts": {}, "keys": {name: planned.key for name, planned in plan.items()}}
 
 
@@ -108,7 +109,7 @@ def _todo(run: RunConfig, plan: Mapping[str, Planned], artifacts: Mapping[str, A
         if name in todo or (artifacts[name] is not None and name not in again):
             return
         todo.add(name)
-        for parent in plan[name].stage.reads(plan[name].config):
+        for parent in plan[name].inputs({other: other for other in plan}).values():
             need(parent)
 
     for name in (*again, *run.stage):

@@ -7,9 +7,11 @@ from its own checkpoints. Either gets artifacts and returns records or files; it
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pipeline.config import StageConfig
@@ -42,17 +44,29 @@ class Stage:
 
     name: ClassVar[str]
     version: ClassVar[int]  # bump when the same config gives other output
-    inputs: ClassVar[tuple[str, ...]] = ()  # names of the stages it reads, or may read (see ``reads``)
+    # What it reads, or may read (see ``reads``): stages, or roles of stages where the two have different names
+    inputs: ClassVar[tuple[str, ...] | Mapping[str, str]] = ()
     Config: ClassVar[Any]  # a StageConfig, or a union of them told apart by `name`
     reasons: ClassVar[Mapping[str, str]] = {}  # closed list: reject reason -> what it means
     headline: ClassVar[str | None] = None  # the file under files/ whose path ends a run of this stage (a report)
 
+    @classmethod
+    def roles(cls) -> dict[str, str]:
+        """Role -> the stage that plays it. Equal names stay short: ``inputs = ("mesh",)``."""
+        return dict(cls.inputs) if isinstance(cls.inputs, Mapping) else {name: name for name in cls.inputs}
+
     def reads(self, config: StageConfig) -> tuple[str, ...]:
-        """Those of ``inputs`` that this config needs: all, unless a stage leaves out what only an option asks for.
+        """The roles of ``inputs`` that this config needs: all, unless a stage leaves out what only an option asks for.
 
         The others enter neither the key nor the run.
         """
-        return self.inputs
+        return tuple(self.roles())
+
+    def agree(self, config: StageConfig, configs: Mapping[str, StageConfig]) -> None:
+        """Raise UserError where this config does not go with those of the stages before it, by stage name in ``configs``.
+
+        Called for every plan, before anything runs.
+        """
 
     def slug(self, config: StageConfig) -> str:
         """A few letters for people, at the head of the artifact's folder name."""
@@ -134,7 +148,16 @@ class System:
     modules: Mapping[str, str]  # stage name -> "package.module:Class"
     groups: tuple[str, ...] = ()  # config groups that stages share by interpolation (``model: ${model}``)
     packages: tuple[str, ...] = ()  # whose versions a manifest records
+    targets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # what `make NAME` makes: stages, by target
+    commands: str = ""  # "package.module:function" that mounts the system's own commands on `lightmill`
     _loaded: dict[str, Stage] = field(default_factory=dict, compare=False, repr=False)
+
+    @property
+    def folder(self) -> Path:
+        """The folder of its stages' modules, where its folder ``conf`` may lie."""
+        spec = importlib.util.find_spec(next(iter(self.modules.values())).partition(":")[0])
+        assert spec is not None and spec.origin is not None
+        return Path(spec.origin).parent
 
     def stage(self, name: str) -> Stage:
         """The stage of that name. Its module is imported here, so it must be cheap to import."""
@@ -149,35 +172,26 @@ class System:
         """Position of the stage, for listings only."""
         return list(self.modules).index(name)
 
-    def upstream(self, targets: Iterable[str]) -> list[str]:
-        """The targets and everything they read, in an order in which each stage follows its inputs."""
-        order: list[str] = []
-
-        def visit(name: str, path: tuple[str, ...]) -> None:
-            if name in path:
-                raise AssertionError(f"stages form a cycle: {' -> '.join((*path, name))}")
-            if name not in order:
-                for parent in self.stage(name).inputs:
-                    visit(parent, (*path, name))
-                order.append(name)
-
-        for target in targets:
-            visit(target, ())
-        return order
-
 
 def load_system(name: str) -> System:
-    """The engine's one dynamic import: the module ``stages.<name>``, or the dotted module ``name``, supplies ``SYSTEM``."""
+    """The engine's one dynamic import: a module that supplies ``SYSTEM``.
+
+    It is ``stages.<name>``, or a module of that name (dots allowed) that Python finds elsewhere, such as in the folder that
+    the command runs in.
+    """
     if not re.match(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*\Z", name):
         raise UserError(f"system={name!r} is not a name of a system")
-    module_name = name if "." in name else f"stages.{name}"
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name != module_name:
-            raise
-        raise UserError(f"system={name!r} is unknown: there is no module {module_name}") from None
-    return module.SYSTEM
+    for module_name in (f"stages.{name}", name):
+        try:
+            module = importlib.import_module(module_name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+                raise
+            continue
+        if not isinstance(getattr(module, "SYSTEM", None), System):
+            continue
+        return module.SYSTEM
+    raise UserError(f"system={name!r} is unknown: there is no module stages.{name} or {name} with a SYSTEM")
 
 
 __all__ = [

@@ -62,18 +62,19 @@ class RunState:
         self.update(now=True, status=status, message=message)
 
 
-def read_states(store: Store, stage: str | None = None) -> list[dict[str, Any]]:
+def read_states(store: Store, place: str | None = None) -> list[dict[str, Any]]:
     """One plain dict per draft of the store, the one that changed last at the end.
 
     ``state``: running (``items``: which process is at what, and for how long), stopped (``message`` says why) or dead.
     """
     found = []
     for path in store.drafts():
-        if stage not in (None, path.parent.name):
+        where = store.place_of(path)
+        if place not in (None, where):
             continue
         key = path.name.removesuffix(".partial")
         facts = _read(path / "running" / RUN)
-        holder = store.claim(path.parent.name, key).holder()
+        holder = store.claim(where, key).holder()
         state = "running" if holder else "stopped" if "status" in facts else "dead"
         marked = list((path / "markers").glob("[!.]*.json"))
         items = []
@@ -84,7 +85,8 @@ def read_states(store: Store, stage: str | None = None) -> list[dict[str, Any]]:
                     items.append({"item": item["item"], "pid": item["pid"], "seconds": round(time.time() - item["time"], 1)})
         changed = max([file.stat().st_mtime for file in (path / "markers", path / "running") if file.exists()], default=0.0)
         found.append(
-            {**facts, "stage": path.parent.name, "key": key, "state": state, "holder": holder, "parts_done": len(marked),
+            {**facts, "stage": path.parent.name, "place": where,
+             "key": key, "state": state, "holder": holder, "parts_done": len(marked),
              "items": items, "changed": changed, "path": str(path)}
         )  # fmt: skip
     return sorted(found, key=lambda state: state["changed"])
@@ -106,7 +108,7 @@ def lines(state: Mapping[str, Any]) -> list[str]:
         "stopped": f"stopped with status {state.get('status')} at {clock}",
         "dead": f"not running: its process ended without a word (killed?), last sign {clock}",
     }[state["state"]]
-    out = [f"{state['stage']}/{state['key'][:12]}.partial  {what}"]
+    out = [f"{state['place']}/{state['key'][:12]}.partial  {what}"]
 
     def add(name: str, text: str) -> None:
         out.append(f"  {name:<9} {text}")

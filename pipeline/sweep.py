@@ -1,44 +1,38 @@
-"""A sweep (``-m``): the jobs that its overrides span, all their keys before the first one starts, and jobs side by side.
+"""A sweep (``-m``): the jobs that its overrides span, each composed once, all their keys before the first one starts.
 
-Hydra runs the jobs one after the other in this process. With ``jobs=N`` they run N at a time instead, each in a process of its
-own with its share of the cores, so that one that dies takes no other with it; what all jobs share is made first, with all
-cores. Either way a job whose keys are no longer those of the plan stops: Hydra composes a job only when its turn comes.
+Jobs run one after the other in this process. With ``jobs=N`` they run N at a time, each in a process of its own with its
+share of the cores and GPUs, so that one that dies takes no other with it; what all jobs share is made first, with all cores.
+Where a launcher of Hydra is asked for (``hydra/launcher=slurm``), that starts the jobs. A job whose keys are no longer those
+of the plan, because a source file changed meanwhile, stops.
 """
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 import os
+import queue
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
+from omegaconf import DictConfig
 
-from pipeline.errors import UserError
+from pipeline.errors import UserError, for_people, status_of
 from pipeline.executor import THREAD_VARIABLES
-from pipeline.hydra_config import compose
-from pipeline.plan import Planned, make_plan, split_config
+from pipeline.hydra_config import compose, initialized, parse_overrides, system_of, to_plain
+from pipeline.plan import Planned, hashes_of, make_plan, split_config
 from pipeline.run import run_pipeline
-from pipeline.store import HashCache, Store
-from pipeline.worker import die_with_parent
-
-# The jobs of one sweep: of each a hash of its overrides and one of its keys. It goes where the jobs go, to other machines
-# too, and it is small: Linux starts no process with a variable of 128 KiB.
-KEYS_VARIABLE = "LIGHTMILL_SWEEP_KEYS"
-HASH_LETTERS = 8
-MAX_JOBS = 8000
-JOB_VARIABLE = "LIGHTMILL_SWEEP_JOB"  # set in the processes of jobs that run side by side
+from pipeline.store import Store
 
 Plan = Mapping[str, Planned]
+LAUNCHER = "hydra/launcher="
 
 
 @dataclass(frozen=True)
@@ -53,14 +47,17 @@ class Job:
     def name(self) -> str:
         return " ".join(self.words)
 
+    @cached_property
+    def keys(self) -> dict[str, str]:
+        """Stage name -> key."""
+        return {name: planned.key for name, planned in self.plan.items()}
+
 
 def plan_of(root: Mapping[str, Any]) -> dict[str, Planned]:
+    """The plan of a composed config. Hashes of source files are kept for the next plan."""
     run, system, sections = split_config(root)
-    return make_plan(run, system, sections, HashCache(Store(run.store).root / ".cache" / "hashes.json"))
-
-
-def keys_of(plan: Plan) -> dict[str, str]:
-    return {name: planned.key for name, planned in plan.items()}
+    with hashes_of(Store(run.store)) as hashes:
+        return make_plan(run, system, sections, hashes)
 
 
 def is_hydras(word: str) -> bool:
@@ -69,78 +66,32 @@ def is_hydras(word: str) -> bool:
 
 
 def expand(overrides: Sequence[str]) -> list[Job]:
-    """The jobs of a sweep, in Hydra's order."""
+    """The jobs of a sweep, in Hydra's order. The same combination twice is one job."""
+    parsed = parse_overrides([word for word in overrides if not is_hydras(word)])
     try:
-        parsed = OverridesParser.create().parse_overrides([word for word in overrides if not is_hydras(word)])
         batches = BasicSweeper.split_arguments(parsed, None)
     except HydraException as error:
         raise UserError(str(error).splitlines()[0]) from None
-    roots = [(tuple(words), compose(words)) for batch in batches for words in batch]
-    return [Job(words, root, plan_of(root)) for words, root in roots]
+    roots = {tuple(words): compose(words) for batch in batches for words in batch}
+    return [Job(words, root, plan_of(root)) for words, root in roots.items()]
 
 
-def for_hydra(overrides: Sequence[str]) -> list[str]:
-    """The overrides of a sweep as Hydra's own launch takes them.
-
-    It first composes those with one value by themselves, without the groups that the sweep chooses, and refuses what only such
-    a group knows. As a choice of one, such a word waits for its job.
-    """
-
-    def known(words: Sequence[str]) -> bool:
-        try:
-            compose(words)
-        except UserError:
-            return False
-        return True
-
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    single = [word for word, override in zip(overrides, parsed, strict=True) if not override.is_sweep_override()]
-    asked = [word for word in single if not is_hydras(word) and "=" in word]
-    waiting = set() if known(asked) else {word for word in asked if not known([word])}
-    return [
-        f"{name}=choice({value})" if word in waiting else word for word in overrides for name, _, value in [word.partition("=")]
-    ]
-
-
-def sweep_keys(overrides: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Keys of every job of a sweep, by the job's overrides."""
-    return {job.name: keys_of(job.plan) for job in expand(overrides)}
-
-
-def _hash(text: str) -> str:
-    return base64.urlsafe_b64encode(hashlib.blake2b(text.encode(), digest_size=HASH_LETTERS * 3 // 4).digest()).decode()
-
-
-def _entry(task: str, keys: Mapping[str, str]) -> str:
-    return _hash(task) + _hash(json.dumps(keys, sort_keys=True))
-
-
-def planned_keys(keys: Mapping[str, Mapping[str, str]]) -> str:
-    """KEYS_VARIABLE for jobs of these overrides and keys."""
-    if len(keys) > MAX_JOBS:
-        raise UserError(f"a sweep of {len(keys)} jobs: at most {MAX_JOBS} at a time, so leave out some values")
-    return "".join(_entry(task, own) for task, own in keys.items())
-
-
-def check_keys(task: str, root: Mapping[str, Any]) -> None:
-    """UserError if the job ``task`` is one of a sweep that planned other keys for it."""
-    told = os.environ.get(KEYS_VARIABLE, "")
-    known = {told[start : start + 2 * HASH_LETTERS] for start in range(0, len(told), 2 * HASH_LETTERS)}
-    if any(entry.startswith(_hash(task)) for entry in known) and _entry(task, keys_of(plan_of(root))) not in known:
-        raise UserError(f"the config or a source file changed after the sweep began: job {task!r} has other keys now")
+def check_keys(name: str, root: Mapping[str, Any], planned_keys: Mapping[str, str]) -> None:
+    """UserError if the config gives other keys now than when the sweep began."""
+    if {stage: planned.key for stage, planned in plan_of(root).items()} != planned_keys:
+        raise UserError(f"the config or a source file changed after the sweep began: job {name!r} has other keys now")
 
 
 def shared_stages(jobs: Sequence[Job]) -> dict[str, str]:
     """Stage -> key, of the stages whose artifact is the same for all jobs."""
-    first = keys_of(jobs[0].plan)
-    return {name: key for name, key in first.items() if all(keys_of(job.plan).get(name) == key for job in jobs)}
+    return {name: key for name, key in jobs[0].keys.items() if all(job.keys.get(name) == key for job in jobs)}
 
 
 def describe(jobs: Sequence[Job]) -> str:
     """One line: what the jobs share, with the key of the last shared stage, and how many artifacts the others come to."""
     shared = shared_stages(jobs)
     names = list(dict.fromkeys(name for job in jobs for name in job.plan))
-    own = [f"{name} {len({keys_of(job.plan).get(name) for job in jobs} - {None})}" for name in names if name not in shared]
+    own = [f"{name} {len({job.keys.get(name) for job in jobs} - {None})}" for name in names if name not in shared]
     text = f"sweep: {len(jobs)} jobs"
     if shared:
         last = list(shared)[-1]
@@ -153,9 +104,30 @@ def label(job: Job, jobs: Sequence[Job]) -> str:
     return " ".join(word.partition("=")[2] for word in job.words if not all(word in other.words for other in jobs)) or job.name
 
 
-def run_side_by_side(
-    jobs: Sequence[Job], at_once: int, hydra_words: Sequence[str], command: Sequence[str], out: Callable[[str], None]
-) -> dict[str, int]:
+# -- one after the other
+
+
+def run_in_turn(jobs: Sequence[Job], command: Sequence[str], out: Callable[[str], None]) -> dict[str, int]:
+    """Run the jobs in this process; returns the exit status of each. One that fails is told, and the next one runs."""
+    statuses = {}
+    for job in jobs:
+        out(f"== {job.name}")
+        try:
+            check_keys(job.name, job.root, job.keys)
+            run_pipeline(job.root, command, out)
+            statuses[job.name] = 0
+        except ValueError as error:  # UserError, and what model/ says of bad input
+            if job.root["debug"] or not for_people(error):
+                raise
+            print(f"error: {error}", file=sys.stderr, flush=True)
+            statuses[job.name] = status_of(error)
+    return statuses
+
+
+# -- side by side
+
+
+def run_side_by_side(jobs: Sequence[Job], at_once: int, command: Sequence[str], out: Callable[[str], None]) -> dict[str, int]:
     """Run the jobs ``at_once`` at a time in processes of their own; returns the exit status of each by its label."""
     todo = [job for job in jobs if not _complete(job)]
     shared = shared_stages(jobs)
@@ -164,7 +136,10 @@ def run_side_by_side(
     cores = max(1, (os.cpu_count() or 1) // at_once)
     names = {job.name: label(job, jobs) for job in jobs}
     width = max(len(name) for name in names.values())
-    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(cores)) | {JOB_VARIABLE: "1"}
+    free: queue.SimpleQueue[Mapping[str, str]] = queue.SimpleQueue()  # one environment for each job that runs at a time
+    for devices in deal(visible_gpus(), at_once):
+        own = {} if devices is None else {"CUDA_VISIBLE_DEVICES": ",".join(devices)}
+        free.put(os.environ | dict.fromkeys(THREAD_VARIABLES, str(cores)) | own)
 
     def run(job: Job) -> int:
         def say(text: str) -> None:
@@ -173,18 +148,24 @@ def run_side_by_side(
         if job not in todo:  # says so, and that it was used
             run_pipeline(job.root, command, say)
             return 0
-        words = list(job.words)
-        if job.root["workers"] == "auto":
-            words = [word for word in words if not word.startswith("workers=")] + [f"workers={cores}"]
-        keys = planned_keys({" ".join(words): keys_of(job.plan)})
-        process = subprocess.Popen(
-            [sys.executable, "-m", "pipeline", *words, *hydra_words],
-            env=environment | {KEYS_VARIABLE: keys}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        )  # fmt: skip
-        assert process.stdout is not None
-        for line in process.stdout:
-            say(line.rstrip("\n"))
-        status = process.wait()
+        root = {**job.root, "workers": cores if job.root["workers"] == "auto" else job.root["workers"]}
+        environment = free.get()
+        try:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "pipeline.job"],
+                env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            )  # fmt: skip
+            assert process.stdin is not None and process.stdout is not None
+            try:
+                json.dump({"name": job.name, "root": root, "keys": job.keys, "command": list(command)}, process.stdin)
+                process.stdin.close()
+            except BrokenPipeError:  # it died before it could read: its status says how
+                pass
+            for line in process.stdout:
+                say(line.rstrip("\n"))
+            status = process.wait()
+        finally:
+            free.put(environment)
         return status if status >= 0 else 128 - status  # killed by a signal: the shells' number
 
     pool = ThreadPoolExecutor(at_once)
@@ -194,17 +175,33 @@ def run_side_by_side(
         pool.shutdown(cancel_futures=True)
 
 
-def live_with_the_sweep() -> None:
-    """In the process of a job: end with the sweep that started it, but let Ctrl-C reach this process too."""
-    if os.environ.pop(JOB_VARIABLE, None):
-        die_with_parent()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+def visible_gpus() -> list[str]:
+    """The GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them; empty without an NVIDIA driver."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if named is not None:
+        return [device for device in named.split(",") if device]
+    try:
+        query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
+        done = subprocess.run(query, capture_output=True, text=True, timeout=20)
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    return done.stdout.split() if done.returncode == 0 else []
+
+
+def deal(gpus: Sequence[str], at_once: int) -> list[list[str] | None]:
+    """For each of the jobs that run at a time its GPUs: an equal share, or one that others use too. None without GPUs."""
+    if not gpus:
+        return [None] * at_once
+    if at_once > len(gpus):
+        return [[gpus[slot % len(gpus)]] for slot in range(at_once)]
+    return [list(gpus[slot::at_once]) for slot in range(at_once)]
 
 
 def _complete(job: Job) -> bool:
     run = split_config(job.root)[0]
     store = Store(run.store)
-    return not run.force and not run.retry and all(store.find(name, job.plan[name].key) is not None for name in run.stage)
+    planned = [job.plan[name] for name in run.stage]
+    return not run.force and not run.retry and all(store.find(one.place, one.key) is not None for one in planned)
 
 
 def _make_shared(job: Job, shared: Mapping[str, str], command: Sequence[str], out: Callable[[str], None]) -> None:
@@ -215,5 +212,71 @@ def _make_shared(job: Job, shared: Mapping[str, str], command: Sequence[str], ou
             raise UserError(
                 f"{setting}={','.join(ours)}: all jobs of the sweep share it; do that by itself, then run the sweep"
             )
-    read = {parent for name in shared for parent in job.plan[name].stage.reads(job.plan[name].config)}
+    names = {name: name for name in job.plan}
+    read = {parent for name in shared for parent in job.plan[name].inputs(names).values()}
     run_pipeline({**job.root, "stage": [name for name in shared if name not in read], "force": [], "retry": []}, command, out)
+
+
+# -- by a launcher of Hydra
+
+
+def launcher_of(overrides: Sequence[str]) -> str | None:
+    """The launcher that the overrides ask for."""
+    asked = [word.removeprefix(LAUNCHER) for word in overrides if word.startswith(LAUNCHER)]
+    return asked[-1] if asked else None
+
+
+def run_by_launcher(
+    jobs: Sequence[Job], overrides: Sequence[str], command: Sequence[str], out: Callable[[str], None]
+) -> dict[str, int]:
+    """Hand the jobs to Hydra's launcher, which composes each once more where it runs; returns the exit status of each."""
+    from hydra._internal.callbacks import Callbacks
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.plugins import Plugins
+    from hydra.core.singleton import Singleton  # noqa: F401 - a launcher pickles it
+    from hydra.types import HydraContext, RunMode
+
+    planned = {job.name: job.keys for job in jobs}
+    commands = list(command)
+
+    def work(config: DictConfig) -> int:
+        from hydra.core.hydra_config import HydraConfig
+
+        words = [word for word in HydraConfig.get().overrides.task if not is_hydras(word)]
+        root = to_plain(config)
+        try:
+            check_keys(" ".join(words), root, planned[" ".join(words)])
+            run_pipeline(root, commands, lambda text: print(text, flush=True))
+        except ValueError as error:
+            if not for_people(error):
+                raise
+            print(f"error: {error}", file=sys.stderr, flush=True)
+            return status_of(error)
+        return 0
+
+    system = system_of(overrides)
+    with initialized(system) as more:
+        loader = GlobalHydra.instance().config_loader()
+        hydra_words = [word for word in overrides if is_hydras(word)]
+        try:
+            config = loader.load_configuration("config", overrides=[*hydra_words, *more], run_mode=RunMode.MULTIRUN)
+            launcher = Plugins.instance().instantiate_launcher(
+                hydra_context=HydraContext(config_loader=loader, callbacks=Callbacks()), task_function=work, config=config
+            )
+        except HydraException as error:
+            raise UserError(str(error).splitlines()[0]) from None
+        out(f"launcher: {len(jobs)} jobs by {launcher_of(overrides)}")
+        returns = launcher.launch([list(job.words) for job in jobs], initial_job_idx=0)
+    statuses = {}
+    for job, result in zip(jobs, returns, strict=True):
+        try:
+            statuses[label(job, jobs)] = int(result.return_value)
+        except Exception as error:  # whatever the job died of, on whatever machine
+            print(f"error: {label(job, jobs)}: {error}", file=sys.stderr, flush=True)
+            statuses[label(job, jobs)] = status_of(error)
+    return statuses
+
+
+def restore_interrupts() -> None:
+    """In the process of a job: Ctrl-C reaches it, whatever its parent made of it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)

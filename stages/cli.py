@@ -1,22 +1,29 @@
-"""The ``lightmill`` command: run, the store's commands, export and import, and trace, predict, compare for single scenes.
-
-Heavy libraries are imported by the command that needs them, so that ``lightmill ls`` answers at once.
-"""
+"""The ``lightmill`` command: run, the store's commands, and what each system brings (``System.commands``)."""
 
 from __future__ import annotations
 
 import argparse
-import json
+import importlib
 import os
+import pkgutil
 import sys
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Sequence
 
+import stages
 from pipeline.commands import add_commands
 from pipeline.errors import INTERRUPTED, UserError, for_people, status_of
+from pipeline.stage import System
 
 PROGRAM = "lightmill"
+
+
+def systems() -> Iterator[System]:
+    """The project's systems: the packages of ``stages`` that supply one."""
+    for module in pkgutil.iter_modules(stages.__path__):
+        if module.ispkg:
+            system = getattr(importlib.import_module(f"stages.{module.name}"), "SYSTEM", None)
+            if isinstance(system, System):
+                yield system
 
 
 def command_run(arguments: argparse.Namespace) -> int:
@@ -25,305 +32,24 @@ def command_run(arguments: argparse.Namespace) -> int:
     return run_main([*arguments.words, *(["--debug"] if arguments.debug else [])])
 
 
-def command_trace(arguments: argparse.Namespace) -> int:
-    from stages.renderformer.inference.trace import trace
-
-    for path in trace(
-        Path(arguments.scene),
-        Path(arguments.out),
-        resolution=arguments.resolution,
-        spp=arguments.spp,
-        mode=arguments.mode,
-        denoise=arguments.denoise,
-        seed=arguments.seed,
-        view=arguments.view,
-        lights_visible=arguments.lights_visible,
-        triangles=arguments.triangles,
-        room=room(arguments),
-    ):
-        print(path)
-    return 0
-
-
-def room(arguments: argparse.Namespace) -> Any:
-    from stages.renderformer.inference.room import Room
-
-    return Room(arguments.room, arguments.up)
-
-
-def command_predict(arguments: argparse.Namespace) -> int:
-    from stages.renderformer.inference.renderer import predict
-
-    for path in predict(
-        arguments.scene,
-        arguments.checkpoint,
-        Path(arguments.out),
-        resolution=arguments.resolution,
-        view=arguments.view,
-        device=arguments.device,
-        frames=arguments.orbit,
-        arc_deg=arguments.arc,
-        fps=arguments.fps,
-        tonemap=arguments.tonemap,
-        exposure=arguments.exposure,
-        composite_lights=arguments.composite_lights,
-        triangles=arguments.triangles,
-        room=room(arguments),
-        store=arguments.store,
-    ):
-        print(path)
-    return 0
-
-
-def command_compare(arguments: argparse.Namespace) -> int:
-    from stages.graphics.metrics import with_lpips
-    from stages.renderformer.inference.compare import IMAGES, check_picture, compare_images, compare_scene
-    from stages.renderformer.inference.renderer import write_png
-
-    first, out = Path(arguments.a), arguments.out
-    metrics = with_lpips(arguments.lpips, arguments.lpips_folder)
-    if out is not None:
-        check_picture(Path(out), [first, *([Path(arguments.b)] if arguments.b is not None else [])])
-    if arguments.b is not None or first.suffix.lower() in IMAGES:
-        if arguments.b is None:
-            raise UserError(f"{first} is an image: give the test image as well, or one scene instead of both")
-        if arguments.checkpoint is not None:
-            raise UserError("two images are compared as they are: leave --checkpoint out, or give one scene")
-        result = compare_images(first, arguments.b, metrics)
-    else:
-        result = compare_scene(
-            first,
-            arguments.checkpoint,
-            arguments.resolution,
-            arguments.view,
-            spp=arguments.spp,
-            device=arguments.device,
-            composite_lights=arguments.composite_lights,
-            triangles=arguments.triangles,
-            room=room(arguments),
-            store=arguments.store,
-            metrics=metrics,
-        )
-        out = out or f"{first.stem}-compare.png"
-    print(json.dumps(result.to_json(), indent=1) if arguments.json else result.table(), flush=True)
-    if out is not None:
-        write_png(Path(out), result.picture())
-        if not arguments.json:
-            print(f"picture: {out}")
-    return 0
-
-
-def dataset_source(reference: str, store: str) -> Any:
-    """A dataset's folder or URL as given, or a shard artifact in the store."""
-    from stages.renderformer.dataset.shards import INDEX, REMOTE
-
-    if REMOTE.match(reference) or (Path(reference) / "files" / INDEX).is_file():
-        return reference
-    from pipeline.store import Store
-
-    artifact = Store(store).resolve(reference)
-    if artifact.stage != "shard":
-        raise UserError(f"{reference} is an artifact of stage {artifact.stage}: give one of stage shard, a folder or a URL")
-    return artifact
-
-
-def command_export(arguments: argparse.Namespace) -> int:
-    from stages.renderformer.dataset.interchange import export
-
-    source, out = dataset_source(arguments.dataset, arguments.store), Path(arguments.out)
-    count = sum(1 for _ in export(source, out, arguments.split, arguments.images))
-    print(f"{count} scenes in {out}")
-    return 0
-
-
-def command_sweep(arguments: argparse.Namespace) -> int:
-    from stages.renderformer.evaluation.ablation import sweep
-
-    return sweep(arguments.table, arguments.rows, arguments.words, Path(arguments.out or f"runs/{arguments.table}"))
-
-
-def command_table(arguments: argparse.Namespace) -> int:
-    from stages.renderformer.evaluation.ablation import write_table
-
-    return write_table(arguments.table, arguments.rows, arguments.words, Path(arguments.out or f"runs/{arguments.table}"))
-
-
-def command_import(arguments: argparse.Namespace) -> int:
-    from pipeline.__main__ import main as run_main
-
-    words = ["stage=scene", "scene=imported", f"scene.path={json.dumps(arguments.folder)}", *arguments.words]
-    return run_main([*words, *(["--debug"] if arguments.debug else [])])
-
-
-def command_report(arguments: argparse.Namespace) -> int:
-    from pipeline.store import Store
-    from stages.renderformer.evaluation.side_by_side import write_report
-
-    for path in write_report(
-        arguments.keys,
-        Store(arguments.store),
-        Path(arguments.out),
-        gallery=arguments.gallery,
-        different_data=arguments.different_data,
-        title=arguments.title,
-    ):
-        print(path)
-    return 0
-
-
-def view_argument(text: str) -> int | str:
-    if text == "all":
-        return text
-    try:
-        return int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor 'all'") from None
-
-
-def resolution_argument(text: str) -> int | tuple[int, int]:
-    """Pixels per side, or WIDTHxHEIGHT as (height, width)."""
-    try:
-        sides = [int(word) for word in text.split("x")]
-    except ValueError:
-        sides = []
-    if len(sides) not in (1, 2):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither pixels per side nor WIDTHxHEIGHT")
-    return sides[0] if len(sides) == 1 else (sides[1], sides[0])
-
-
-def exposure_argument(text: str) -> float | None:
-    """Factor of a number of stops; None for 'auto'."""
-    if text == "auto":
-        return None
-    try:
-        stops = float(text)
-    except ValueError:
-        stops = float("nan")
-    if not -32 <= stops <= 32:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a number of stops (-32 to 32) nor 'auto'")
-    return 2.0**stops
-
-
 def build_parser() -> argparse.ArgumentParser:
     debug = argparse.ArgumentParser(add_help=False)
     debug.add_argument("--debug", action="store_true", help="show the traceback of an error")
     parser = argparse.ArgumentParser(
-        PROGRAM, description="Make data for, train and evaluate neural renderers of triangle meshes.", parents=[debug]
+        PROGRAM, description="Make data for, train and evaluate neural renderers of meshes.", parents=[debug]
     )
     parsers = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    def add(name: str, function, summary: str, example: str) -> argparse.ArgumentParser:
-        sub = parsers.add_parser(name, help=summary, description=summary, epilog=f"example: {PROGRAM} {name} {example}")
-        sub.set_defaults(function=function)
-        return sub
-
-    sub = add("run", command_run, "run stages (the same as python -m pipeline)", "stage=shard scene.count.train=200")
-    sub.usage = f"{PROGRAM} run [stage=STAGE] [name=value ...] [-m] [--debug]"
-    add_commands(parsers, PROGRAM)
-
-    sub = add("export", command_export, "scenes of a dataset as released HDF5 files", "shard exported --split test --images")
-    sub.add_argument("dataset", help="shard artifact's key, name or 'shard'; a dataset's folder or URL")
-    sub.add_argument("out", help="folder; scenes go to OUT/SPLIT/ID.h5")
-    sub.add_argument("--split", action="append", help="train, validation or test; may be repeated (default: all)")
-    sub.add_argument("--images", action="store_true", help="also ID-view<camera>.exr: linear RGB with all lights on")
-    sub.add_argument("--store", default="store", help="the store's folder (default: store)")
-
-    sub = add(
-        "import", command_import, "released JSON and HDF5 scenes as scenes to render (then: stage=render scene=imported ..)",
-        "scenes scene.split=test",
-    )  # fmt: skip
-    sub.add_argument("folder", help="folder of scene files; train/, validation/ and test/ in it are splits")
-    sub.usage = f"{PROGRAM} import FOLDER [name=value ...] [--debug]"
-
-    for name, function, summary in (
-        ("sweep", command_sweep, "train and evaluate the rows of the paper's table 1, then write the table"),
-        ("table", command_table, "write the table of the rows that the store holds"),
-    ):
-        sub = add(name, function, summary, "table1_small --rows full,no_dpt jobs=2")
-        sub.add_argument("table", nargs="?", default="table1_small", help="folder of conf/experiment (default: table1_small)")
-        sub.add_argument("--rows", type=lambda text: text.split(","), help="some rows, comma-separated (default: all)")
-        sub.add_argument("-o", "--out", help="folder of table.md, table.json and table.png (default: runs/TABLE)")
-        sub.usage = f"{PROGRAM} {name} [TABLE] [--rows ROW,...] [-o FOLDER] [name=value ...] [--debug]"
-
-    scene_help = "scene file in a released format (.json, .h5), or a mesh (.glb, .gltf, .obj, .off, .ply, .stl)"
-
-    def add_mesh_options(sub: argparse.ArgumentParser, triangles: str) -> None:
-        group = sub.add_argument_group("a mesh gets a room, lights and a camera")
-        group.add_argument("--room", choices=("floor", "wall", "corner", "box"), help="default: a corner, if triangles allow")
-        group.add_argument("--up", choices=("x", "-x", "y", "-y", "z", "-z"), metavar="AXIS",
-                           help="the file's axis that points up: x, y, z, --up=-y .. (default: z for STL, else y)")  # fmt: skip
-        group.add_argument("--triangles", type=int, metavar="N", help=f"decimate it, N triangles in all (default: {triangles})")
-
-    def add_model_options(sub: argparse.ArgumentParser) -> None:
-        sub.add_argument(
-            "--checkpoint",
-            help="released-format folder, or a train artifact's key, name or 'train' (default: the model that ships)",
-        )
-        sub.add_argument("--composite-lights", action="store_true", help="one pass per light, summed: for many lights")
-        sub.add_argument("--device", default="auto", help="cpu, cuda or auto (default)")
-        sub.add_argument("--store", default="store", help="the store's folder (default: store)")
-
-    sub = add("trace", command_trace, "path trace a scene or mesh file", "scene.json -o out.exr --spp 256")
-    sub.add_argument("scene", help=scene_help)
-    sub.add_argument("-o", "--out", required=True, help="output .exr (linear RGB float); with --view all: OUT-0.exr, OUT-1.exr")
-    sub.add_argument("--resolution", type=int, default=512, help="pixels per side (default: 512)")
-    sub.add_argument("--spp", type=int, default=256, help="samples per pixel (default: 256)")
-    sub.add_argument("--mode", choices=("physical", "cycles"), default="physical", help="what the renderer matches")
-    sub.add_argument("--denoise", action=argparse.BooleanOptionalAction, default=True, help="Open Image Denoise (default: on)")
-    sub.add_argument("--seed", type=int, default=0)
-    sub.add_argument("--lights-visible", action="store_true",
-                     help="cameras see the lights (default: as in training, they do not)")  # fmt: skip
-    sub.add_argument("--view", type=view_argument, default=0, help="camera number, or 'all' (default: 0)")
-    add_mesh_options(sub, "as it is")
-
-    sub = add(
-        "predict", command_predict, "render a scene or mesh file with a trained model, a still or an animation",
-        "chair.glb --checkpoint train -o chair.png   |   lightmill predict chair.glb -o chair.mp4 --orbit 48",
-    )  # fmt: skip
-    sub.add_argument("scene", help=scene_help)
-    sub.add_argument(
-        "-o", "--out", required=True, help="output .exr (linear), .png, or .mp4 (its frames as PNGs in a folder of that name)"
+    summary = "run stages (the same as python -m pipeline)"
+    sub = parsers.add_parser(
+        "run", help=summary, description=summary, epilog=f"example: {PROGRAM} run stage=shard scene.count.train=200"
     )
-    sub.add_argument("--resolution", type=resolution_argument, metavar="N",
-                     help="pixels per side, divisible by 8, or WIDTHxHEIGHT (default: as it was trained)")  # fmt: skip
-    sub.add_argument("--view", type=view_argument, default=0, help="camera number, or 'all' (default: 0)")
-    sub.add_argument("--orbit", type=int, metavar="FRAMES", help="so many frames around the scene, starting at --view")
-    sub.add_argument("--arc", type=float, metavar="DEGREES", help="of the orbit (default: all around, or what walls allow)")
-    sub.add_argument("--fps", type=int, default=24, help="frames per second of an .mp4 (default: 24)")
-    sub.add_argument("--tonemap", default="none", metavar="NAME",
-                     help="none (clamp, default), reinhard, filmic, aces, agx or pbr_neutral; of .png and .mp4")  # fmt: skip
-    sub.add_argument("--exposure", type=exposure_argument, default=1.0, metavar="STOPS",
-                     help="of .png and .mp4, or 'auto' (default: 0)")  # fmt: skip
-    add_model_options(sub)
-    add_mesh_options(sub, "as the checkpoint was trained")
-
-    sub = add(
-        "compare", command_compare, "all metrics between two images, or between a scene path traced and predicted",
-        "scene.json --checkpoint train   |   lightmill compare reference.exr out.exr --json",
-    )  # fmt: skip
-    sub.add_argument("a", metavar="SCENE | A", help=f"{scene_help}; or the reference image: .exr or .png")
-    sub.add_argument("b", nargs="?", metavar="B", help="test image of the same size")
-    sub.add_argument("-o", "--out", help="picture: both images, their difference x5, HDR-FLIP (of a scene: SCENE-compare.png)")
-    sub.add_argument("--json", action="store_true", help="print JSON")
-    sub.add_argument("--lpips", choices=("none", "vgg", "alex"), default="none", help="LPIPS as well, by that network")
-    sub.add_argument("--lpips-folder", metavar="FOLDER", help="where its published weights lie")
-    group = sub.add_argument_group("of a scene")
-    group.add_argument("--resolution", type=int, metavar="N", help="pixels per side (default: as the checkpoint was trained)")
-    group.add_argument("--view", type=int, default=0, help="camera number (default: 0)")
-    group.add_argument("--spp", type=int, default=256, help="samples per pixel of the reference (default: 256)")
-    add_model_options(sub)
-    add_mesh_options(sub, "as the checkpoint was trained")
-
-    sub = add(
-        "report", command_report, "runs side by side, and probes, on one HTML page (with JSON and Markdown beside it)",
-        "small=evaluate/test-0123456789ab tiny=evaluate/test-ba9876543210 -o ablation.html",
-    )  # fmt: skip
-    sub.add_argument("keys", nargs="+", metavar="KEY", help="artifacts of evaluate and probe, or NAME=KEY with a name to show")
-    sub.add_argument("-o", "--out", required=True, help="the page, .html")
-    sub.add_argument("--gallery", type=int, default=24, help="views shown, evenly spaced from worst to best (default: 24)")
-    sub.add_argument("--different-data", action="store_true", help="also runs that were evaluated on different scenes")
-    sub.add_argument("--title", help="the page's title")
-    sub.add_argument("--store", default="store", help="the store's folder (default: store)")
+    sub.set_defaults(function=command_run, takes_words=True)
+    sub.usage = f"{PROGRAM} run [system=NAME] [stage=STAGE] [name=value ...] [-m] [--debug]"
+    add_commands(parsers, PROGRAM)
+    for system in systems():
+        if system.commands:
+            module, _, function = system.commands.partition(":")
+            getattr(importlib.import_module(module), function)(parsers, PROGRAM)
     for sub in parsers.choices.values():
         sub.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show the traceback of an error")
     return parser
@@ -331,8 +57,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Returns the exit status: 0, or that of the error (see pipeline.errors)."""
+    sys.path.append(os.getcwd())  # as `python -m pipeline` has it: a system may lie in the folder that the command runs in
     arguments, unknown = build_parser().parse_known_args(words)
-    if arguments.function in (command_run, command_import, command_sweep, command_table):
+    takes_words = getattr(arguments, "takes_words", False)
+    if takes_words:
         arguments.words = unknown  # overrides and Hydra's own flags, in any order
     elif unknown:
         build_parser().error(f"unknown arguments: {' '.join(unknown)}; see {PROGRAM} COMMAND --help")
@@ -342,7 +70,7 @@ def main(words: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0
     except (ValueError, OSError) as error:
-        path = isinstance(error, OSError) and arguments.function not in (command_run, command_import)  # one that was given
+        path = isinstance(error, OSError) and not takes_words  # one that was given
         if arguments.debug or not (path or for_people(error)):
             raise
         print(f"error: {error}", file=sys.stderr)

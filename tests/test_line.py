@@ -28,7 +28,6 @@ def folder(tmp_path_factory) -> Path:
 
 def run(folder: Path, *words: str, status: int = 0) -> str:
     command = [sys.executable, "-m", "pipeline", *SMALL, f"store={folder}/store", *words]
-    command += [f"hydra.run.dir={folder}/runs", f"hydra.sweep.dir={folder}/runs"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == status, done.stdout + done.stderr
     return done.stdout
@@ -105,7 +104,7 @@ def test_a_probe_with_one_more_value_computes_only_that(first, folder):
 def test_the_rows_of_a_table_share_the_data_and_end_in_it(first, folder):
     words = ["sweep", "table1_small", "--rows", "full,world_space", "-o", f"{folder}/table", "jobs=2", f"store={folder}/store"]
     words += [*SMALL, "train.steps=2", *TINY, "model.latent_dim=128"]
-    words += [f"hydra.run.dir={folder}/runs", f"hydra.sweep.dir={folder}/runs"]
+    words += [f"hydra.run.dir={folder}/runs"]
     for again in (False, True):
         swept = subprocess.run([sys.executable, "-m", "stages.cli", *words], cwd=ROOT, capture_output=True, text=True)
         assert swept.returncode == 0, swept.stdout + swept.stderr
@@ -129,7 +128,7 @@ TINY = [
 def test_a_folder_of_meshes_is_a_source(shared_data, folder):
     words = ["collect=folder", f"collect.path={shared_data / 'meshes' / 'dungeon'}", "remesh.resolution=48"]
     small = [word for word in SMALL if not word.startswith("collect.per_family")]
-    command = [sys.executable, "-m", "pipeline", *words, *small, f"store={folder}/store", f"hydra.run.dir={folder}/runs"]
+    command = [sys.executable, "-m", "pipeline", *words, *small, f"store={folder}/store"]
     done = subprocess.run([*command, "stage=scene"], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     store = Store(folder / "store")
@@ -151,7 +150,6 @@ def test_too_few_meshes_stop_the_run_and_say_how_many(folder, tmp_path):
         f"collect.path={tmp_path}",
         "stage=collect",
         f"store={tmp_path}/s",
-        f"hydra.run.dir={tmp_path}/r",
     ]
     done = subprocess.run([sys.executable, "-m", "pipeline", *words], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2

@@ -42,7 +42,7 @@ Pair = tuple[np.ndarray, np.ndarray]  # a reference and a prediction, each (H, W
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How to train; the paper's values are in ``conf/train/paper_256.yaml``."""
+    """How to train; the paper's values are in ``conf/renderformer/train/paper_256.yaml``."""
 
     steps: int
     lr: float = 1e-4

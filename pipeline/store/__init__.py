@@ -10,7 +10,7 @@ a marker then says that the part is finished. Killing a process anywhere leaves 
 run continues.
 """
 
-from pipeline.store.artifact import DRAFT, SCHEMA, Artifact, is_sound, read_draft
+from pipeline.store.artifact import DRAFT, SCHEMA, Artifact, is_sound, place, read_draft
 from pipeline.store.claim import Claim
 from pipeline.store.draft import UNKNOWN, Draft, PartWriter
 from pipeline.store.folder import Store, history, iter_inputs, store_of
@@ -21,5 +21,6 @@ from pipeline.store.record import RECORD_ID, Record, record_digest
 __all__ = [
     "DRAFT", "RECORD_ID",
     "SCHEMA", "UNKNOWN", "Artifact", "Claim", "Draft", "HashCache", "Listing", "PartWriter", "Record", "Row",
-    "Store", "history", "is_sound", "iter_inputs", "read_draft", "record_digest", "store_of",
+    "Store", "history", "is_sound",
+    "place", "iter_inputs", "read_draft", "record_digest", "store_of",
 ]  # fmt: skip

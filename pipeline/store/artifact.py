@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import Damaged, UserError
-from pipeline.keys import digest_of
+from pipeline.keys import LEGACY_SYSTEM, digest_of
 from pipeline.store.files import (
     hash_file,
     read_jsonl,
@@ -20,6 +20,12 @@ from pipeline.store.record import Record, record_digest
 
 SCHEMA = 2  # of manifests; from 2 on they are sealed, so that a changed byte shows
 DRAFT = "draft.json"  # what is being made; stays with the artifact
+
+
+def place(preimage: Mapping[str, Any]) -> str:
+    """Where artifacts of this preimage lie, relative to the store: ``SYSTEM/STAGE``, of the legacy system ``STAGE``."""
+    system, stage = preimage.get("system", LEGACY_SYSTEM), preimage["stage"]
+    return stage if system == LEGACY_SYSTEM else f"{system}/{stage}"
 
 
 def is_sound(path: Path, digest: str) -> bool:
@@ -133,6 +139,24 @@ class Artifact(Records):
     @property
     def stage(self) -> str:
         return self.manifest["preimage"]["stage"]
+
+    @property
+    def system(self) -> str:
+        return self.manifest["preimage"].get("system", LEGACY_SYSTEM)
+
+    @property
+    def place(self) -> str:
+        """Where it lies in the store, from what it says of itself; from its path where it is too damaged to say."""
+        try:
+            about: Mapping[str, Any] | None = self.manifest
+        except Damaged:
+            about = read_draft(self.path)
+        return self.path.parent.name if about is None else place(about["preimage"])
+
+    @property
+    def name(self) -> str:
+        """How people name it: ``STAGE/FOLDER``, or ``SYSTEM/STAGE/FOLDER``."""
+        return f"{self.place}/{self.path.name}"
 
     @property
     def codes(self) -> list[str]:

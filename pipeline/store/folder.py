@@ -21,6 +21,7 @@ from pipeline.store.files import (
     write_sealed,
 )
 
+PLACES = ("[!.]*", "[!.]*/[!.]*")  # patterns of the folders that hold artifacts: STAGE, SYSTEM/STAGE
 TRASH = (".trash/*", "[!.]*/.gone-*", "[!.]*/*/.gone-*")  # the last two: how an earlier gc named what it was deleting
 
 
@@ -33,43 +34,76 @@ class Store:
 
     # -- finding
 
-    def folder(self, stage: str, key: str) -> Path | None:
-        """The folder of the committed artifact, sound or damaged."""
-        return next(iter((self.root / stage).glob(f"[!.]*-{key[:12]}")), None)
+    def folder(self, place: str, key: str) -> Path | None:
+        """The folder of the committed artifact, sound or damaged. ``place``: see ``pipeline.store.place``."""
+        return next(iter((self.root / place).glob(f"[!.]*-{key[:12]}")), None)
 
-    def find(self, stage: str, key: str) -> Artifact | None:
+    def find(self, place: str, key: str) -> Artifact | None:
         """The committed artifact; an error where its manifest is damaged."""
-        path = self.folder(stage, key)
+        path = self.folder(place, key)
         return Artifact(path) if path is not None and Artifact(path).key == key else None
 
-    def artifacts(self, stage: str | None = None) -> list[Artifact]:
-        """All committed artifacts whose manifests can be read, oldest first."""
-        found = []
-        for path in self.folders(stage):
+    def by_key(self, key: str) -> Artifact | None:
+        """The committed artifact of that key, wherever it lies; an error where its manifest is damaged."""
+        for path in self._glob(f"[!.]*-{key[:12]}"):
+            if Artifact(path).key == key:
+                return Artifact(path)
+        return None
+
+    def _glob(self, name: str, place: str | None = None) -> list[Path]:
+        """Folders of that name at the place, or at all of them: ``STAGE`` and ``SYSTEM/STAGE``."""
+        places = PLACES if place is None else (place,)
+        return sorted(path for where in places for path in self.root.glob(f"{where}/{name}"))
+
+    def place_of(self, path: Path) -> str:
+        """The place of an artifact or draft of this store."""
+        return path.parent.relative_to(self.root).as_posix()
+
+    def artifacts(self, place: str | None = None) -> list[Artifact]:
+        """All committed artifacts (of that place) whose manifests can be read, oldest first."""
+        dated = []
+        for path in self.folders(place):
             with contextlib.suppress(Damaged):
                 artifact = Artifact(path)
-                found.append((artifact.manifest["finished"], str(path), artifact))
-        return [artifact for _, _, artifact in sorted(found, key=lambda entry: entry[:2])]
+                dated.append((artifact.manifest["finished"], str(path), artifact))
+        return [artifact for _, _, artifact in sorted(dated, key=lambda entry: entry[:2])]
 
-    def folders(self, stage: str | None = None) -> list[Path]:
-        """The folders of all committed artifacts, sound or damaged."""
-        found = self.root.glob(f"{stage or '[!.]*'}/[!.]*-" + "[0-9a-f]" * 12)
-        return sorted(path for path in found if (path / "manifest.json").exists() or (path / DRAFT).exists())
+    def folders(self, place: str | None = None) -> list[Path]:
+        """The folders of all committed artifacts (of that place), sound or damaged."""
+        named = self._glob("[!.]*-" + "[0-9a-f]" * 12, place)
+        return [path for path in named if (path / "manifest.json").exists() or (path / DRAFT).exists()]
 
     def drafts(self) -> list[Path]:
-        return sorted(self.root.glob("[!.]*/[!.]*.partial"))
+        return self._glob("[!.]*.partial")
+
+    def places(self, reference: str | None = None) -> list[str]:
+        """The places that hold something. ``reference``: ``STAGE``, ``SYSTEM/STAGE`` or ``SYSTEM``, all of its stages.
+
+        ``STAGE`` alone is the legacy system's, or, where that has none of the name, the only system's that has one.
+        """
+        places = sorted({self.place_of(path) for path in (*self.folders(), *self.drafts())})
+        if reference is None or reference in places:
+            return places if reference is None else [reference]
+        of_system = [where for where in places if where.startswith(f"{reference}/")]
+        return of_system or [where for where in places if where.endswith(f"/{reference}")]
 
     def resolve(self, reference: str) -> Artifact:
-        """The artifact that a person means: a key or its beginning, ``stage/folder``, a folder, or a stage's newest."""
+        """The artifact that a person means: a key or its beginning, ``stage/folder``, a folder, or a stage's newest.
+
+        A stage of a system is ``system/stage``; see ``places`` for what ``stage`` alone means.
+        """
         path = Path(reference)
         for folder in (path, self.root / reference if ".." not in path.parts else path):
             if (folder / "manifest.json").is_file() or ((folder / DRAFT).is_file() and folder.suffix != ".partial"):
                 return Artifact(folder)
-        stage, _, rest = reference.rpartition("/")
-        if not stage and (newest := self.artifacts(reference) if reference.isidentifier() else []):
+        where, _, rest = reference.rpartition("/")
+        places = [name for name in self.places(reference) if name.rpartition("/")[2] == rest]
+        if len(places) > 1:
+            raise UserError(f"{reference!r} is a stage of several systems: say which ({', '.join(places)})")
+        if places and (newest := self.artifacts(places[0])):
             return newest[-1]
         token = rest.rpartition("-")[2]
-        found = [Artifact(path) for path in self.folders(stage or None) if len(token) >= 4 and self._is_key(token, path)]
+        found = [Artifact(path) for path in self.folders(where or None) if len(token) >= 4 and self._is_key(token, path)]
         if len(found) == 1:
             return found[0]
         if found:
@@ -89,7 +123,7 @@ class Store:
 
     def draft(
         self,
-        stage: str,
+        place: str,
         key: str,
         preimage: Mapping[str, Any],
         out: Any = print,
@@ -102,29 +136,29 @@ class Store:
         ``origin``: what it takes to make it anew (system, config). ``purpose``: make, force or repair; what force did not begin
         itself it sets aside. ``code``: the digest of the code at work.
         """
-        path = self.draft_path(stage, key)
+        path = self.draft_path(place, key)
         before = read_draft(path)
         begun = any(any((path / folder).glob("[!.]*")) for folder in ("markers", "state"))
         if begun and purpose == "force" and (before or {}).get("purpose") != "force":
             aside = self.trash(path)
             out(f"   note: force takes nothing of what an earlier run had finished; that is in {aside} until gc deletes it")
             before, begun = None, False
-        draft = Draft(path, stage, key, preimage, out)
+        draft = Draft(path, place.rpartition("/")[2], key, preimage, out)
         about = {"key": key, "preimage": draft.preimage, "started": time.time(), **(origin or {})} if before is None else before
         others = [other for other in about.get("codes", [UNKNOWN]) if other != code] if begun else []
         if others and code != UNKNOWN:
             whose = "code that nobody noted" if others == [UNKNOWN] else "other code of the same version"
-            out(f"   note: what is finished of {stage} was made by {whose}; it is kept (to begin anew, delete {path})")
+            out(f"   note: what is finished of {place} was made by {whose}; it is kept (to begin anew, delete {path})")
         facts = {"purpose": purpose, "codes": [*others, code]}
         if before is None or not facts.items() <= before.items():
             write_sealed(path / DRAFT, {**about, **facts})
         return draft
 
-    def draft_path(self, stage: str, key: str) -> Path:
-        return self.root / stage / f"{key}.partial"
+    def draft_path(self, place: str, key: str) -> Path:
+        return self.root / place / f"{key}.partial"
 
-    def claim(self, stage: str, key: str) -> Claim:
-        return Claim(self.root / stage / f".{key}.claim")
+    def claim(self, place: str, key: str) -> Claim:
+        return Claim(self.root / place / f".{key}.claim")
 
     def commit(self, draft: Draft, slug: str, manifest: Mapping[str, Any], replace: bool = False) -> Artifact:
         """Make the draft an artifact by one rename.
@@ -141,12 +175,12 @@ class Store:
         problems = Artifact(draft.path).verify()
         if problems:  # somebody else is at work in the same draft after all
             raise MachineError(f"{draft.path} changed while it was being committed ({problems[0]}): run the same command again")
-        old = self.folder(draft.stage, draft.key)
+        old = self.folder(self.place_of(draft.path), draft.key)
         if old is not None and not replace and not Artifact(old).verify():
             shutil.rmtree(draft.path)
             target = old
         else:
-            target = self.root / draft.stage / f"{slug}-{draft.key[:12]}"
+            target = draft.path.with_name(f"{slug}-{draft.key[:12]}")
             if old is not None:
                 self.trash(old)
             os.replace(draft.path, target)
@@ -207,7 +241,7 @@ class Store:
         ]
         for path in self.drafts():
             key = path.name.removesuffix(".partial")
-            held = key != claimed and self.claim(path.parent.name, key).holder() is not None
+            held = key != claimed and self.claim(self.place_of(path), key).holder() is not None
             if not held and not _changed_since(path, horizon):
                 found.append((path, f"unfinished and untouched for {days:g} days"))
             elif (draft := read_draft(path)) is not None:
@@ -233,11 +267,12 @@ class Store:
 
         Out of sight first, so that a kill in the middle leaves no half artifact.
         """
-        stage, name = path.relative_to(self.root).parts[:2]
-        if stage != ".trash" and not path.name.startswith(".gone-"):
-            node = None if name.endswith(".partial") else self._node(self.root / stage / name)
-            key = node.key if node is not None else name.removesuffix(".partial")
-            claim = self.claim(stage, key)
+        parts = path.relative_to(self.root).parts
+        if parts[0] != ".trash" and not path.name.startswith(".gone-"):
+            folder = path.parent if path.name in WORKING else path  # of the artifact or draft
+            node = None if folder.suffix == ".partial" else self._node(folder)
+            key = node.key if node is not None else folder.name.removesuffix(".partial")
+            claim = self.claim(self.place_of(folder), key)
             if not claim.take():
                 return False
             try:
@@ -305,9 +340,9 @@ def store_of(artifact: Artifact) -> Store:
 
 
 def iter_inputs(store: Store, artifact: Artifact) -> Iterator[tuple[str, str, Artifact | None]]:
-    """(input name, key, artifact or None if it is gone) of each input."""
-    for name, key in artifact.manifest["preimage"]["inputs"].items():
-        yield name, key, store.find(name, key)
+    """(role, key, artifact or None if it is gone) of each input."""
+    for role, key in artifact.manifest["preimage"]["inputs"].items():
+        yield role, key, store.by_key(key)
 
 
 def history(inputs: Mapping[str, Artifact]) -> dict[str, dict[str, Any]]:

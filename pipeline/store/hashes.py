@@ -35,6 +35,12 @@ class HashCache:
             self._changed = True
         return entry[3]
 
+    def __enter__(self) -> HashCache:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.save()
+
     def save(self) -> None:
         if self._changed:
             with contextlib.suppress(OSError):  # only a cache

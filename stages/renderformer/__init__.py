@@ -8,7 +8,7 @@ SYSTEM = System(
         "collect": "stages.renderformer.s00_collect:Collect",
         "remesh": "stages.renderformer.s01_remesh:Remesh",
         "decimate": "stages.renderformer.s02_decimate:Decimate",
-        "scene": "stages.renderformer.s03_scene:SampleScene",
+        "scene": "stages.renderformer.s03_variants:Scene",
         "render": "stages.renderformer.s04_render:Render",
         "shard": "stages.renderformer.s05_shard:Shard",
         "train": "stages.renderformer.s06_given:TrainOrGiven",
@@ -16,6 +16,8 @@ SYSTEM = System(
         "probe": "stages.renderformer.s08_probe:RunProbe",
     },
     groups=("model",),
+    targets={"data": ("shard",), "eval": ("evaluate",)},  # train is a stage
+    commands="stages.renderformer.commands:add_commands",
     packages=(
         "lightmill", "torch", "mitsuba", "drjit", "trimesh", "pymeshlab", "libigl", "scikit-image", "numpy", "scipy",
         "OpenEXR", "pyoidn", "webdataset", "hydra-core", "flip-evaluator",

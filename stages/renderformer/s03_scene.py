@@ -183,7 +183,7 @@ class SampleScene(MapStage):
 
     def reads(self, config: SceneConfig) -> tuple[str, ...]:
         """*collect* has the objects' base colours, and nothing else that a scene needs."""
-        return self.inputs if config.textures.share > 0 else ("decimate",)
+        return ("collect", "decimate") if config.textures.share > 0 else ("decimate",)
 
     def slug(self, config: SceneConfig) -> str:
         return f"{config.name}-{config.max_triangles}"

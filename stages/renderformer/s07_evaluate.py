@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from pipeline.config import StageConfig, count, runtime
+from pipeline.config import StageConfig, report, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.graphics.device import choose_device
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 class EvaluateConfig(StageConfig):
     split: Literal["test", "validation", "train"] = "test"
     baseline_views: int = Field(1024, ge=1)  # a mean of 1,024 is within 0.005 dB of the mean of all, in bounded memory
-    gallery: int = Field(24, ge=0)  # views shown in the report
+    gallery: int = report(24, ge=0)  # views shown in the report
     lpips: Literal["none", "vgg", "alex"] = "none"
     lpips_folder: str | None = runtime(None)  # where its weights lie; which they are is known from the network's name
-    timing_scenes: int = count(5, ge=0)  # scenes on which the stages are timed, 0: none; no record depends on it
+    timing_scenes: int = report(5, ge=0)  # scenes on which the stages are timed, 0: none
     device: Literal["auto", "cpu", "cuda"] = runtime("auto")
 
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
+from pipeline.config import StageConfig
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.graphics.device import choose_device
@@ -44,6 +45,11 @@ class RunProbe(MapStage):
 
     def reads(self, config: ProbeConfig) -> tuple[str, ...]:
         return PROBES[config.name].reads
+
+    def agree(self, config: ProbeConfig, configs: Mapping[str, StageConfig]) -> None:
+        scene = configs.get("scene")
+        if "decimate" in self.reads(config) and scene is not None and scene.name == "imported":
+            raise UserError(f"probe={config.name} shows objects by other meshes of their ladder, which imported scenes lack")
 
     def slug(self, config: ProbeConfig) -> str:
         return config.name.replace("_", "-")
@@ -101,17 +107,6 @@ class RunProbe(MapStage):
     def check(self, draft: Draft) -> None:
         for name in ("figure.png", "probe.json", "table.md"):
             assert (draft.files / name).is_file(), f"probe wrote no {name}"
-
-
-class ProbeImported(RunProbe):
-    """In the system of imported scenes, which have no ladder of meshes."""
-
-    inputs = ("shard", "train")
-
-    def reads(self, config: ProbeConfig) -> tuple[str, ...]:
-        if "decimate" in super().reads(config):
-            raise UserError(f"probe={config.name} shows objects by other meshes of their ladder, which imported scenes lack")
-        return super().reads(config)
 
 
 def model_facts(worker: Worker) -> dict[str, Any]:

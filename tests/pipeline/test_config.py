@@ -21,7 +21,7 @@ from stages import cli
 ROOT = Path(__file__).resolve().parents[2]
 SYSTEM = load_system("renderformer")
 ENGINE_FIELDS = {"workers", "limits", "max_reject_share"}  # every stage has them; config.yaml names them for map stages
-VARIANTS = [(stage, path.stem) for stage in SYSTEM.modules for path in sorted((CONF / stage).glob("*.yaml"))]
+VARIANTS = [(stage, path.stem) for stage in SYSTEM.modules for path in sorted((CONF / "renderformer" / stage).glob("*.yaml"))]
 NEEDED = {("collect", "folder"): ["collect.path=/tmp"], ("collect", "objaverse"): ["collect.ids=[a]"]}
 
 
@@ -65,7 +65,7 @@ def test_limits_of_the_paper_s_scenes():
         assert config.limits.model_dump(exclude_none=True) == {"cpu_s": 7200, "wall_s": 14400}
 
 
-@pytest.mark.parametrize("model", sorted(path.stem for path in (CONF / "model").glob("*.yaml")))
+@pytest.mark.parametrize("model", sorted(path.stem for path in (CONF / "renderformer" / "model").glob("*.yaml")))
 def test_every_model_is_a_valid_config(model):
     parse(SYSTEM.stage("train").Config, compose([f"model={model}", "train.informed_start=inputs"])["train"], "train")
 
@@ -105,7 +105,7 @@ def test_wrong_values_are_named_as_they_are_written(overrides, message):
 @pytest.mark.parametrize("flags", [["-m"], []])
 def test_command_line_accepts_the_sweep_flag_anywhere(tmp_path, flags):
     words = ["stage=train", "plan=true", "model=tiny,small" if flags else "model=tiny", f"store={tmp_path}", *flags]
-    command = [sys.executable, "-m", "pipeline", *words, f"hydra.sweep.dir={tmp_path}/r", f"hydra.run.dir={tmp_path}/r"]
+    command = [sys.executable, "-m", "pipeline", *words]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("06 train") == (2 if flags else 1)
@@ -123,7 +123,7 @@ def test_only_errors_for_people_are_one_line(tmp_path, monkeypatch, capsys, erro
 
     monkeypatch.setattr("pipeline.__main__.run_pipeline", fail)
     monkeypatch.setattr(sys, "argv", ["lightmill"])
-    words = ["stage=collect", f"store={tmp_path}", f"hydra.run.dir={tmp_path}/r"]
+    words = ["stage=collect", f"store={tmp_path}"]
     for start in (main, lambda words: cli.main(["run", *words])):
         if status == 1:
             with pytest.raises(ValueError):

@@ -10,29 +10,14 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import UserError
-from pipeline.hydra_config import compose
 from pipeline.store import Store
-from pipeline.sweep import (
-    JOB_VARIABLE,
-    KEYS_VARIABLE,
-    check_keys,
-    describe,
-    expand,
-    keys_of,
-    label,
-    plan_of,
-    planned_keys,
-    run_side_by_side,
-    shared_stages,
-    sweep_keys,
-)
+from pipeline.sweep import check_keys, deal, describe, expand, label, run_side_by_side, shared_stages
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def run(folder: Path, *words: str, **variables: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "pipeline", *words, f"store={folder}/store"]
-    command += [f"hydra.run.dir={folder}/runs", f"hydra.sweep.dir={folder}/runs"]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=os.environ | variables)
 
 
@@ -50,16 +35,74 @@ def folders(tmp_path) -> tuple[Path, Path]:
     return good, few
 
 
+def keys(words: list[str]) -> dict[str, dict[str, str]]:
+    return {job.name: job.keys for job in expand(words)}
+
+
 def test_sweep_keys_are_known_before_it_runs(tmp_path):
     words = ["stage=train", "model=tiny,small", f"store={tmp_path}"]
-    keys = sweep_keys(words)
-    first, second = keys.values()
-    assert list(keys) == [f"stage=train model={name} store={tmp_path}" for name in ("tiny", "small")]
+    first, second = keys(words).values()
+    assert list(keys(words)) == [f"stage=train model={name} store={tmp_path}" for name in ("tiny", "small")]
     assert first["train"] != second["train"]
     assert {name: key for name, key in first.items() if name != "train"} == {
         name: key for name, key in second.items() if name != "train"
     }
-    assert sweep_keys([*words, f"hydra.sweep.dir={tmp_path}"]) == keys  # Hydra leaves its own settings out of a job's name too
+    assert keys([*words, f"hydra.sweep.dir={tmp_path}"]) == keys(words)  # Hydra's own settings belong to no job
+
+
+SCENE = ["plan=true", "stage=scene"]
+CASES = [  # from users' reports of Hydra: words, number of jobs
+    (["scene.lights.count=[1,4],[1,8]"], 2),
+    (["scene.lights.count=[1, 4], [1, 8]"], 2),
+    (["scene.lights.count=choice([1,4],[1,8])"], 2),
+    (["seed=range(0,3)"], 3),
+    (["seed=0,1,0"], 2),  # the same job twice is one
+    (["scene.weights={floor_single:1,floor_multi:0}"], 1),
+    (["scene.weights.floor_single=1,2", "scene.weights.floor_multi=0,5"], 4),
+    (["scene=released,paper", "scene.max_triangles=512"], 2),
+    (["scene=released,paper", "scene.max_triangles=512,640", "seed=1,2"], 8),
+    (["seed=1,2", "hydra.verbose=true"], 2),
+    (["seed=1,2", "scene.max_triangles=512", "seed=3"], 1),  # of a key that comes twice the last one counts
+]
+
+
+@pytest.mark.parametrize(("words", "count"), CASES, ids=lambda value: " ".join(value) if isinstance(value, list) else "")
+def test_commas_brackets_and_quotes_make_the_jobs_that_a_person_means(tmp_path, words, count):
+    jobs = expand([*SCENE, f"store={tmp_path}", *words])
+    assert len(jobs) == len({job.name for job in jobs}) == count
+
+
+WRONG = [  # words, what the one line names
+    (["seed=1,"], "'seed=1,' .*comma"),
+    (["scene.lights.count=[1,8"], r"'scene.lights.count=\[1,8' .*do not pair"),
+    (["seed="], "seed"),
+    (["+note='a,b"], "note"),
+    (["scene.cameras.views=4,x"], "scene.cameras.views='x'"),
+    (["model=tiny,nosuch", "stage=train"], "model=nosuch is unknown"),
+    (["experiment=overfit,paper_256"], "collect.ids"),
+    (['+note="a,b"'], "note is unknown"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), WRONG, ids=lambda value: " ".join(value) if isinstance(value, list) else "")
+def test_a_wrong_word_is_named_before_the_first_job(tmp_path, words, message):
+    with pytest.raises(UserError, match=message) as error:
+        expand([*SCENE, f"store={tmp_path}", *words])
+    assert "\n" not in str(error.value)
+
+
+def test_a_wrong_word_is_one_line_and_status_2(tmp_path):
+    for word in ("seed=1,", "scene.lights.count=[1,8"):
+        for flags in ([], ["-m"]):
+            done = run(tmp_path, *SCENE, word, *flags)
+            assert done.returncode == 2 and done.stderr.splitlines() == [done.stderr.strip()]
+            assert done.stderr.startswith(f"error: {word!r} is not an override: ")
+
+
+def test_the_same_job_twice_side_by_side(tmp_path):
+    done = run(tmp_path, "-m", "system=tests.pipeline.toy", "total.steps=1,1", "jobs=2")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert len(Store(tmp_path / "store").artifacts("toy/total")) == 1
 
 
 def test_an_override_that_only_the_swept_group_knows(tmp_path):
@@ -98,30 +141,65 @@ def test_a_failed_job_leaves_the_others_and_is_taken_up_again(tmp_path, folders)
     assert again.stdout.count("up to date") == 1 and len(Store(tmp_path / "store").artifacts("collect")) == 2
 
 
-def test_a_job_whose_config_is_not_the_planned_one_stops(tmp_path):
-    keys = planned_keys({f"stage=collect collect.per_family=1 store={tmp_path}/store": {"collect": "0" * 64}})
-    done = run(tmp_path, "stage=collect", "collect.per_family=1", **{KEYS_VARIABLE: keys, JOB_VARIABLE: "1"})
-    assert done.returncode == 2 and "changed after the sweep began" in done.stderr
-    assert not Store(tmp_path / "store").artifacts()
+@pytest.mark.parametrize("jobs", [[], ["jobs=2"]])
+def test_a_job_whose_source_changed_after_the_sweep_began_stops(tmp_path, folders, monkeypatch, capsys, jobs):
+    """The first job changes what the second one reads; side by side, what is sent to the process is another key."""
+    from pipeline.__main__ import main
+
+    good, _ = folders
+    words = ["stage=collect", "collect=folder", f"collect.path={good}", "collect.licence=a,b", f"store={tmp_path}/store"]
+    monkeypatch.setattr("pipeline.sweep.shared_stages", lambda jobs: {})
+
+    def change(*arguments) -> bool:
+        (good / "0.obj").write_bytes((good / "0.obj").read_bytes() + b"# changed\n")
+        return False
+
+    monkeypatch.setattr("pipeline.sweep._complete", change)  # side by side: asked once the keys are known
+    if not jobs:
+        from pipeline import sweep
+
+        monkeypatch.setattr("pipeline.sweep.run_pipeline", change)
+        assert sweep.run_in_turn is not None
+    assert main([*words, *jobs, "-m"]) == 2
+    streams = capsys.readouterr()
+    assert "changed after the sweep began" in streams.out + streams.err
 
 
-def test_a_sweep_of_thousands_of_jobs_starts_processes_and_knows_all_their_keys(tmp_path, monkeypatch):
-    """All keys go into one variable of the environment, and Linux refuses those of 128 KiB."""
-    jobs = {
-        f"stage=collect collect.per_family={number} store={tmp_path}": {"collect": f"{number:064}"} for number in range(8000)
-    }
-    monkeypatch.setenv(KEYS_VARIABLE, planned_keys(jobs))
-    subprocess.run(["true"], check=True)
-    root = compose(["stage=collect", "collect.per_family=1", f"store={tmp_path}"])
-    for task in list(jobs)[::1000]:
-        with pytest.raises(UserError, match="changed after the sweep began"):
-            check_keys(task, root)
-    check_keys("stage=collect collect.per_family=9000", root)  # no job of the sweep
-    task = list(jobs)[1]
-    monkeypatch.setenv(KEYS_VARIABLE, planned_keys(jobs | {task: keys_of(plan_of(root))}))
-    check_keys(task, root)
-    with pytest.raises(UserError, match="8001 jobs: at most 8000"):
-        planned_keys(jobs | {"more": {}})
+def test_check_keys_refuses_other_keys(tmp_path):
+    (job,) = expand(["stage=collect", "collect.per_family=1", f"store={tmp_path}"])
+    check_keys(job.name, job.root, job.keys)
+    with pytest.raises(UserError, match="changed after the sweep began"):
+        check_keys(job.name, job.root, {"collect": "0" * 64})
+
+
+def test_gpus_are_dealt_to_the_jobs_that_run_at_a_time():
+    assert deal([], 2) == [None, None]
+    assert deal(["0", "1", "2", "3"], 2) == [["0", "2"], ["1", "3"]]
+    assert deal(["0", "1"], 2) == [["0"], ["1"]]
+    assert deal(["4", "6"], 3) == [["4"], ["6"], ["4"]]
+
+
+def test_each_job_sees_its_own_gpus(tmp_path, monkeypatch):
+    """Two jobs at a time on two GPUs: their processes get one each."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    show = [sys.executable, "-c", "import os, sys; sys.stdin.read(); print('sees', os.environ['CUDA_VISIBLE_DEVICES'])"]
+    popen = subprocess.Popen
+    monkeypatch.setattr("pipeline.sweep.subprocess.Popen", lambda words, **options: popen(show, **options))
+    jobs = expand(["stage=collect", "collect.per_family=1,2", f"store={tmp_path}"])
+    lines: list[str] = []
+    assert run_side_by_side(jobs, 2, ["test"], lines.append) == {"1": 0, "2": 0}
+    assert sorted(line.rpartition(" ")[2] for line in lines if "sees" in line) == ["3", "5"]
+
+
+def test_a_launcher_of_hydra_starts_the_jobs(tmp_path):
+    """Hydra's own basic one, in this process; of Slurm's nothing but its composition differs."""
+    words = ["-m", "hydra/launcher=basic", "system=tests.pipeline.toy", "total.steps=1,2", f"hydra.sweep.dir={tmp_path}/runs"]
+    done = run(tmp_path, *words)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "launcher: 2 jobs by basic" in done.stdout
+    assert len(Store(tmp_path / "store").artifacts("toy/total")) == 2
+    failed = run(tmp_path, *words, "numbers.n=14", "+numbers.fail=[n001]", "numbers.scale=3")
+    assert failed.returncode != 0 and "2 of 2 jobs failed" in failed.stderr
 
 
 def test_a_job_that_a_signal_killed_has_the_status_that_a_shell_gives_it(tmp_path, monkeypatch):
@@ -129,7 +207,7 @@ def test_a_job_that_a_signal_killed_has_the_status_that_a_shell_gives_it(tmp_pat
     popen = subprocess.Popen
     monkeypatch.setattr("pipeline.sweep.subprocess.Popen", lambda words, **options: popen(killed, **options))
     jobs = expand(["stage=collect", "collect.per_family=1,2", f"store={tmp_path}"])
-    assert run_side_by_side(jobs, 2, [], ["test"], print) == {"1": 137, "2": 137}
+    assert run_side_by_side(jobs, 2, ["test"], print) == {"1": 137, "2": 137}
 
 
 @pytest.mark.parametrize("setting", ["force", "retry"])

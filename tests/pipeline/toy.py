@@ -7,7 +7,7 @@ import signal
 import time
 from pathlib import Path
 
-from pipeline.config import StageConfig, added, count, runtime
+from pipeline.config import StageConfig, added, count, report, runtime
 from pipeline.errors import Reject
 from pipeline.keys import seed_for
 from pipeline.stage import Item, MapStage, Record, RunStage, System
@@ -76,6 +76,7 @@ class Numbers(MapStage):
 
 class SquaresConfig(StageConfig):
     offset: int = 0
+    heading: str = report("")  # of the card
     log_to: str | None = runtime(None)  # a file that gets a line per computed item
     finish_s: float = runtime(0.0)
     unsteady: bool = runtime(False)  # other output each time
@@ -111,7 +112,7 @@ class Squares(MapStage):
             int("no number")
         if config.bug == "file":
             (inputs["numbers"].path / "files" / "nowhere").read_bytes()
-        (draft.files / "card.txt").write_text(f"{len(draft.rows())} squares\n")
+        (draft.files / "card.txt").write_text(f"{config.heading}{len(draft.rows())} squares\n")
         time.sleep(config.finish_s)
         draft.note("count", len(draft.rows()))
 

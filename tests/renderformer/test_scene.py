@@ -26,7 +26,7 @@ N = 2000
 
 
 def config_of(name: str, **overrides) -> SceneConfig:
-    data = OmegaConf.merge(OmegaConf.load(ROOT / f"conf/scene/{name}.yaml"), {"seed": 0}, overrides)
+    data = OmegaConf.merge(OmegaConf.load(ROOT / f"conf/renderformer/scene/{name}.yaml"), {"seed": 0}, overrides)
     return parse(SceneConfig, OmegaConf.to_container(data), "scene")
 
 

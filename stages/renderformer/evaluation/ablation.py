@@ -1,8 +1,8 @@
 """Table 1 of the paper: its rows as one sweep over one dataset, and the table with the paper's numbers beside ours.
 
-Reads ``conf/experiment/<table>/``, a file per row, and from the store what *evaluate* and *train* left for each; writes
-``table.md``, ``table.json`` and ``table.png``. One design choice: a row is found by its key, computed from its config, so that
-the table never shows another run than the one that the files describe. Paper: section 4.1.
+Reads ``conf/renderformer/experiment/<table>/``, a file per row, and from the store what *evaluate* and *train* left for
+each. Writes ``table.md``, ``table.json`` and ``table.png``. One design choice: a row is found by its key, computed from its
+config, so that the table never shows another run than the one that the files describe. Paper: section 4.1.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ BASE = "full"  # the row that the others are held against
 class Row:
     """A row of the paper's table: what it says there, and its figures in the order of `COLUMNS`; None: it gives none."""
 
-    name: str  # the file's, in conf/experiment/<table>/
+    name: str  # the file's, in conf/renderformer/experiment/<table>/
     label: str
     figures: tuple[float, float, float, float] | None
     parameters: str = ""  # as the paper states them
@@ -76,12 +76,12 @@ PAPER = {
 
 
 def tables() -> list[str]:
-    return sorted(path.name for path in (CONF / "experiment").iterdir() if path.is_dir())
+    return sorted(path.name for path in (CONF / "renderformer" / "experiment").iterdir() if path.is_dir())
 
 
 def jobs_of(table: str, names: Sequence[str] | None, overrides: Sequence[str]) -> dict[str, Job]:
     """Row name -> its job, in the table's order; a UserError unless all of them read the same shards."""
-    from pipeline.sweep import expand, keys_of
+    from pipeline.sweep import expand
 
     if table not in tables():
         raise UserError(f"table {table!r} is unknown: choose from {', '.join(tables())}")
@@ -92,7 +92,7 @@ def jobs_of(table: str, names: Sequence[str] | None, overrides: Sequence[str]) -
     expanded = expand([*words(table, rows), *overrides])
     if len(expanded) != len(rows):
         raise UserError("a table is a sweep over its rows alone: give each override one value")
-    shards = {keys_of(job.plan)["shard"] for job in expanded}
+    shards = {job.keys["shard"] for job in expanded}
     if len(shards) > 1:
         raise UserError(f"the rows of {table} read {len(shards)} different datasets: they may differ in model alone")
     return dict(zip(rows, expanded, strict=True))

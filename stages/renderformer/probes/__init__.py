@@ -10,5 +10,5 @@
 ``figures``    strips and curves
 
 To add one: a ``Probe`` (or a ``Sweep``: a config with ``values``, and an ``edit``) listed in ``PROBES`` of its module, a short
-file in conf/probe/, a section in docs/probes.md.
+file in conf/renderformer/probe/, a section in docs/probes.md.
 """

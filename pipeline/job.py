@@ -1,0 +1,28 @@
+"""One job of a sweep in a process of its own: ``python -m pipeline.job`` reads from standard input what the sweep composed."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+from pipeline.interrupts import guarded
+from pipeline.run import run_pipeline
+from pipeline.sweep import check_keys, restore_interrupts
+from pipeline.worker import die_with_parent
+
+
+def main() -> int:
+    """Returns the exit status of the run."""
+    die_with_parent()  # it ends with the sweep that started it ...
+    restore_interrupts()  # ... but Ctrl-C shall reach it
+    job = json.load(sys.stdin)
+
+    def work() -> None:
+        check_keys(job["name"], job["root"] | {"workers": "auto"}, job["keys"])
+        run_pipeline(job["root"], job["command"], lambda text: print(text, flush=True))
+
+    return guarded(work, debug=job["root"]["debug"])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
