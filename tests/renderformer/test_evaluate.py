@@ -424,7 +424,7 @@ def test_the_shipped_config_is_the_default_one():
 
     from tests.conftest import ROOT
 
-    data = yaml.safe_load((ROOT / "conf" / "evaluate" / "default.yaml").read_text())
+    data = yaml.safe_load((ROOT / "conf" / "renderformer" / "evaluate" / "default.yaml").read_text())
     assert parse(EvaluateConfig, data, "evaluate") == EvaluateConfig()
     assert set(data) == set(EvaluateConfig.model_fields) - set(StageConfig.model_fields)  # those: config.yaml
 

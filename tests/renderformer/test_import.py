@@ -82,7 +82,7 @@ def test_the_key_is_that_of_the_content(folder, tmp_path):
 
     def keys(path) -> dict[str, str]:
         run, system, sections = split_config(compose(["stage=render", "scene=imported", f"scene.path={path}"]))
-        assert run.system == "imported"
+        assert run.system == "renderformer"
         return {name: planned.key for name, planned in make_plan(run, system, sections, hash_file).items()}
 
     before = keys(folder)

@@ -18,7 +18,9 @@ from stages.renderformer.probes import attention, edits, made, tokens
 from stages.renderformer.probes.probe import slug
 from stages.renderformer.probes.sweeps import ColouredLight, Lights, TriangleSize
 from stages.renderformer.records import SceneRecord
-from stages.renderformer.s08_probe import PROBES, ProbeImported, RunProbe
+from stages.renderformer.s03_import import ImportConfig
+from stages.renderformer.s03_scene import SceneConfig
+from stages.renderformer.s08_probe import PROBES, RunProbe
 from tests.conftest import ROOT
 from tests.renderformer.fakes import FakeArtifact, decimated, sharded
 from tests.renderformer.test_rendering import jit  # noqa: F401
@@ -369,7 +371,8 @@ def test_a_probe_that_no_scene_suits_says_so(inputs, tmp_path):
     with pytest.raises(UserError, match="none of them suits"):
         Never().scene_ids(Never.Config(), inputs)
     with pytest.raises(UserError, match="ladder"):
-        ProbeImported().reads(Never.Config())
+        RunProbe().agree(Never.Config(), {"scene": ImportConfig(path=str(tmp_path))})
+    RunProbe().agree(Never.Config(), {"scene": SceneConfig()})
 
 
 def test_what_a_record_holds_is_in_its_key():
