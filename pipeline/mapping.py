@@ -194,7 +194,7 @@ def _donations(
     wanted: set[str] = set()
     for artifact in store.artifacts(planned.name):
         manifest = artifact.manifest
-        if manifest["base_key"] != base or manifest["environment"] != environment:
+        if manifest["base_key"] != base or not planned.stage.same_environment(manifest["environment"], environment):
             continue
         try:
             artifact.rows(), artifact.rejects()

@@ -78,6 +78,10 @@ class Stage:
         """
         return {}
 
+    def same_environment(self, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+        """Whether records made in these two environments may be in one artifact."""
+        return one == other
+
 
 class MapStage(Stage):
     """Items in, records out, in parts."""
