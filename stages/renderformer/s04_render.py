@@ -76,6 +76,11 @@ class Render(MapStage):
 
         return same(dict(one), dict(other))
 
+    def max_workers(self, config: RenderConfig, environment: dict[str, Any]) -> int | None:
+        from stages.renderformer.rendering.backend import max_workers
+
+        return max_workers(environment)
+
     def items(self, config: RenderConfig, inputs: Inputs) -> Iterator[Item]:
         for row in inputs["scene"].rows():
             yield Item(row.id, row.group, (("scene", row.id),))

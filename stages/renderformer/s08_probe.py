@@ -64,7 +64,9 @@ class RunProbe(MapStage):
         return one["device"] == other["device"] and same(one["renderer"], other["renderer"])
 
     def max_workers(self, config: ProbeConfig, environment: dict[str, Any]) -> int | None:
-        return 1 if environment["device"] == "cuda" else None
+        from stages.renderformer.rendering.backend import max_workers
+
+        return 1 if environment["device"] == "cuda" else max_workers(environment["renderer"])
 
     def items(self, config: ProbeConfig, inputs: Inputs) -> Iterator[Item]:
         yield from PROBES[config.name].items(config, inputs)

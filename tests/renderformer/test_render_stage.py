@@ -136,6 +136,22 @@ def test_the_version_of_a_library_is_read_off_its_path(libraries):
     assert Render().environment(RenderConfig(), None) == {"backend": "llvm", "library": plain}
 
 
+@pytest.mark.parametrize("visible, number", [(["GPU-a", "GPU-b"], 2), (["GPU-a"], 1), ([], 1)])
+def test_one_process_renders_on_each_gpu(monkeypatch, visible, number):
+    """Each claims a GPU of its own: test_rendering.py."""
+    monkeypatch.setattr(backend, "gpus", lambda: visible)
+    assert Render().max_workers(RenderConfig(), {"backend": "cuda"}) == number
+    for other in (SCALAR, {"backend": "llvm", "llvm": 19}):
+        assert Render().max_workers(RenderConfig(), other) is None
+    for device, renderer, most in (
+        ("cpu", "cuda", number),
+        ("cuda", "cuda", 1),
+        ("cuda", "scalar", 1),
+        ("cpu", "scalar", None),
+    ):
+        assert RunProbe().max_workers(None, {"device": device, "renderer": {"backend": renderer}}) == most
+
+
 def test_summary_tells_samples_errors_and_the_noise_floor(tmp_path, capsys):
     """What ``lightmill show render`` prints, of views whose numbers are given."""
 

@@ -198,6 +198,11 @@ def _title(backend: dict[str, Any]) -> str:
     return " with ".join(f"LLVM {value}" if name == "llvm" else str(value) for name, value in sorted(backend.items()))
 
 
+def max_workers(backend: dict[str, Any]) -> int | None:
+    """At most this many processes render at a time: one for each GPU that this process may use; None for any number."""
+    return max(1, len(gpus())) if backend["backend"] == "cuda" else None
+
+
 def activate(backend: dict[str, Any], threads: int | None = None) -> None:
     """Select the backend's Mitsuba variant in this process, with that many threads (None: all cores)."""
     if backend["backend"] == "llvm":
