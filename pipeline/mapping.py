@@ -140,6 +140,8 @@ def run_map(
     workers = min(workers, len(tasks)) if workers else 0
     if tasks:
         try:
+            draft.prepared.mkdir(exist_ok=True)
+            stage.prepare(config, inputs, draft.prepared)
             if cluster is not None:
                 cluster.run_parts(tasks, limits, on_result, progress.log)
             else:

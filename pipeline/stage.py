@@ -10,6 +10,7 @@ import importlib
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pipeline.config import StageConfig
@@ -103,6 +104,17 @@ class MapStage(Stage):
     def open(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any]) -> Any:
         """A worker, built once per process: whatever `process` wants to keep (libraries, models, readers)."""
         raise NotImplementedError
+
+    def prepare(self, config: StageConfig, inputs: Inputs, folder: Path) -> None:
+        """Write to ``folder`` what every worker would else compute for itself.
+
+        The runner calls it once, before workers start, and again in a run that continues: overwrite what is there, by an
+        atomic rename. The folder is not kept in the artifact.
+        """
+
+    def open_prepared(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any], folder: Path) -> Any:
+        """The worker, as ``open`` builds it, from what ``prepare`` wrote to ``folder``. Only a stage with both needs it."""
+        return self.open(config, inputs, environment)
 
     def process(self, worker: Any, item: Item) -> Iterator[Record] | Iterable[Record]:
         """The item's records; may raise Reject."""
