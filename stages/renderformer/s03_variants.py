@@ -23,7 +23,7 @@ def _variant(data: Any) -> str:
 
 class Scene(MapStage):
     name = "scene"
-    version = 2
+    version = SampleScene.version
     inputs = SampleScene.inputs
     Config = Annotated[
         Annotated[ImportConfig, Tag("imported")] | Annotated[SceneConfig, Tag("sampled")], Discriminator(_variant)
