@@ -48,3 +48,6 @@ def test_the_walk_through_of_a_third_system_works(blocks, tmp_path):
     listed = shell(tmp_path, blocks["list"]).splitlines()
     assert [line.partition("/v1-")[0] for line in listed] == ["words/collect", "words/count", "words/count"]
     assert shell(tmp_path, blocks["read"]) == "cat 0\nsea 2\n"
+
+    changed = shell(tmp_path, blocks["change"])
+    assert "3 items, 2 of them already there" in changed and "2 items, 1 of them already there" in changed
