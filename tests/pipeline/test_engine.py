@@ -331,7 +331,8 @@ def test_what_a_run_found_made_is_in_use_from_its_start_on(run, tmp_path):
 @contextlib.contextmanager
 def held_elsewhere(claim):
     """Another process has the claim."""
-    code = f"import time; from pathlib import Path; from pipeline.store import Claim; print(Claim(Path({str(claim.path)!r})).take(), flush=True); time.sleep(600)"
+    code = "import time; from pathlib import Path; from pipeline.store import Claim; "
+    code += f"print(Claim(Path({str(claim.path)!r})).take(), flush=True); time.sleep(600)"
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout.readline() == "True\n"
