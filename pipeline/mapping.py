@@ -140,6 +140,8 @@ def run_map(
     workers = min(workers, len(tasks)) if workers else 0
     if tasks:
         try:
+            draft.prepared.mkdir(exist_ok=True)
+            stage.prepare(config, inputs, draft.prepared)
             if cluster is not None:
                 cluster.run_parts(tasks, limits, on_result, progress.log)
             else:
@@ -194,7 +196,7 @@ def _donations(
     wanted: set[str] = set()
     for artifact in store.artifacts(planned.place):
         manifest = artifact.manifest
-        if manifest["base_key"] != base or manifest["environment"] != environment:
+        if manifest["base_key"] != base or not planned.stage.same_environment(manifest["environment"], environment):
             continue
         try:
             artifact.rows(), artifact.rejects()

@@ -92,6 +92,10 @@ class Stage:
         """
         return {}
 
+    def same_environment(self, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+        """Whether records made in these two environments may be in one artifact."""
+        return one == other
+
 
 class MapStage(Stage):
     """Items in, records out, in parts."""
@@ -113,6 +117,17 @@ class MapStage(Stage):
     def open(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any]) -> Any:
         """A worker, built once per process: whatever `process` wants to keep (libraries, models, readers)."""
         raise NotImplementedError
+
+    def prepare(self, config: StageConfig, inputs: Inputs, folder: Path) -> None:
+        """Write to ``folder`` what every worker would else compute for itself.
+
+        The runner calls it once, before workers start, and again in a run that continues: overwrite what is there, by an
+        atomic rename. The folder is not kept in the artifact.
+        """
+
+    def open_prepared(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any], folder: Path) -> Any:
+        """The worker, as ``open`` builds it, from what ``prepare`` wrote to ``folder``. Only a stage with both needs it."""
+        return self.open(config, inputs, environment)
 
     def process(self, worker: Any, item: Item) -> Iterator[Record] | Iterable[Record]:
         """The item's records; may raise Reject."""

@@ -283,7 +283,9 @@ def _open(task: PartTask) -> tuple[MapStage, Any]:
     if (task.stage, task.key) not in _opened:
         stage = load_system(task.system).stage(task.stage)
         assert isinstance(stage, MapStage)
-        _opened[task.stage, task.key] = stage, stage.open(task.config, task.inputs, dict(task.environment))
+        prepared = Draft(task.draft, task.stage, task.key, {}).prepared
+        worker = stage.open_prepared(task.config, task.inputs, dict(task.environment), prepared)
+        _opened[task.stage, task.key] = stage, worker
     return _opened[task.stage, task.key]
 
 

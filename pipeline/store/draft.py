@@ -51,6 +51,7 @@ class Draft(Records):
     files = property(lambda self: self.path / "files")
     state = property(lambda self: self.path / "state")
     logs = property(lambda self: self.path / "logs")
+    prepared = property(lambda self: self.state / ".prepared")  # for workers; a hidden name: nothing of the work is finished
 
     def log(self, text: str) -> None:
         """A line in the run's output."""

@@ -69,7 +69,7 @@ class ObjaverseConfig(CollectConfig):
 
 class Collect(MapStage):
     name: ClassVar[str] = "collect"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     Config: ClassVar[Any] = Annotated[ProceduralConfig | FolderConfig | ObjaverseConfig, Field(discriminator="name")]
     reasons: ClassVar[dict[str, str]] = {
         "unreadable": "the file is truncated, malformed or not what its suffix says",
@@ -143,19 +143,20 @@ class Collect(MapStage):
             record = MeshRecord.from_record(draft.read(name))
             return record.vertices.astype(np.float64), record.faces.astype(np.int64)
 
-        same = {}
+        same: dict[str, str] = {}
         if objects:
             order = sorted(objects, key=lambda name: rows[name].item)
             same = catalogue.find_duplicates(order, np.array([signatures[name] for name in order]), mesh)
+        left_out: dict[str, list[str]] = {}  # object -> content hashes of its duplicates
         for name, first in sorted(same.items()):
-            del objects[name]
+            left_out.setdefault(first, []).append(objects.pop(name)["content_hash"])
             draft.reject(rows[name].item, "duplicate", f"same geometry as {rows[first].item}")
         held = {}
         if config.name == "procedural":
             of_family = {family: "test" for family in config.test_families}
             of_family |= {family: "validation" for family in config.validation_families}
             held = {name: of_family[o["family"]] for name, o in objects.items() if o["family"] in of_family}
-        splits = catalogue.fill_splits(list(objects.values()), held)
+        splits = catalogue.fill_splits(list(objects.values()), held, left_out)
         listed = [{**objects[name], "split": splits[name]} for name in sorted(objects)]
         (draft.files / "objects.json").write_bytes(pack_json(listed))
         if config.textures:

@@ -55,7 +55,7 @@ class ImportScene(MapStage):
         root = folder_of(config)
         return {
             "items": {
-                relative: [hash_file(root / relative), *(hash_file(mesh) for mesh in meshes_of(root / relative))]
+                relative: [hash_file(root / relative), *map(hash_file, files_of(root / relative))]
                 if inside(root / relative, root)
                 else "outside"
                 for relative in scene_files(root)
@@ -116,8 +116,15 @@ def is_scene(path: Path) -> bool:
     return isinstance(data, dict) and "objects" in data and "cameras" in data
 
 
+def files_of(path: Path) -> list[Path]:
+    """All files that are opened to read a scene, besides its own: the meshes, each followed by the files beside it."""
+    from stages.renderformer.scenes.released import files_beside
+
+    return [file for mesh in meshes_of(path) for file in (mesh, *files_beside(mesh))]
+
+
 def meshes_of(path: Path) -> list[Path]:
-    """The mesh files inside its folder that a JSON scene names: its content is theirs too."""
+    """The mesh files that a JSON scene names, inside the scene's folder."""
     if path.suffix.lower() != ".json":
         return []
     try:

@@ -146,7 +146,7 @@ class SceneWorker:
             else:
                 entry = entries[placement.index]
                 meshes.append(self.mesh(entry, rung))
-                told = ("object_id", "family", "source", "origin", "licence")
+                told = ("object_id", "content_hash", "family", "source", "origin", "licence")
                 chosen.append({"rung": rung, **{name: entry.get(name) for name in told}})
             if placement.texture is not None:
                 found = self.pattern(placement, meshes[-1]) if placement.shape else self.colours(entry, rung)
@@ -176,7 +176,7 @@ class SceneWorker:
 
 class SampleScene(MapStage):
     name = "scene"
-    version = 2
+    version = 3
     inputs = ("collect", "decimate")
     Config = SceneConfig
     reasons = {"over_budget": "walls, lights and the smallest rungs of the objects exceed max_triangles"}

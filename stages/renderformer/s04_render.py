@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
@@ -70,6 +70,16 @@ class Render(MapStage):
         from stages.renderformer.rendering.backend import choose
 
         return choose(config.backend, previous)
+
+    def same_environment(self, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+        from stages.renderformer.rendering.backend import same
+
+        return same(dict(one), dict(other))
+
+    def max_workers(self, config: RenderConfig, environment: dict[str, Any]) -> int | None:
+        from stages.renderformer.rendering.backend import max_workers
+
+        return max_workers(environment)
 
     def items(self, config: RenderConfig, inputs: Inputs) -> Iterator[Item]:
         for row in inputs["scene"].rows():

@@ -31,7 +31,7 @@ class ShardConfig(StageConfig):
 
 class Shard(MapStage):
     name = "shard"
-    version = 2
+    version = 3
     headline = "card.html"
     inputs = ("scene", "render")
     Config = ShardConfig
@@ -114,10 +114,10 @@ class Shard(MapStage):
 
 
 def note_objects(objects: dict[str, Any], meta: dict[str, Any]) -> None:
-    """Add the objects of a scene: where each is from and under which licence."""
+    """Add the objects of a scene: the hash of its mesh, where each is from and under which licence."""
     for entry in meta["objects"]:
         if entry.get("object_id"):
-            told = {name: entry.get(name) for name in ("family", "source", "origin", "licence")}
+            told = {name: entry.get(name) for name in ("content_hash", "family", "source", "origin", "licence")}
             objects.setdefault(entry["object_id"], {**told, "scenes": 0})["scenes"] += 1
 
 

@@ -18,7 +18,7 @@ from pydantic import Discriminator, Tag
 from pipeline.config import StageConfig, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs
-from stages.renderformer.s06_train import Train, TrainConfig
+from stages.renderformer.s06_train import OBJECTS, Train, TrainConfig
 
 FILES = ("config.json", "model.safetensors")
 
@@ -44,7 +44,7 @@ class TrainOrGiven(Train):
     def identity(self, config: Any, hash_file: Callable[[Any], str]) -> dict[str, Any]:
         if not isinstance(config, GivenConfig):
             return super().identity(config, hash_file)
-        return {name: hash_file(path) for name, path in zip(FILES, checkpoint_files(config), strict=True)}
+        return {path.name: hash_file(path) for path in checkpoint_files(config)}
 
     def estimate(self, config: Any, configs: Mapping[str, StageConfig]) -> list[str]:
         return [] if isinstance(config, GivenConfig) else super().estimate(config, configs)
@@ -67,10 +67,12 @@ class TrainOrGiven(Train):
 
 
 def checkpoint_files(config: GivenConfig) -> list[Path]:
+    """The files of the given checkpoint: config, weights, and the list of its training objects where it has one."""
     if config.checkpoint is None:
         raise UserError("train=given needs a checkpoint: train.checkpoint=FOLDER with config.json and model.safetensors")
     files = [Path(config.checkpoint).expanduser() / name for name in FILES]
     for path in files:
         if not path.is_file():
             raise UserError(f"train.checkpoint={config.checkpoint!r} holds no {path.name}: give a released-format folder")
-    return files
+    listed = files[0].parent / OBJECTS
+    return [*files, listed] if listed.is_file() else files

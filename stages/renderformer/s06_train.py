@@ -2,9 +2,9 @@
 
 Reads the train and validation splits of *shard*; writes ``checkpoint/`` in the released format (the model after the last
 step: with a cosine to zero that is the one to use, and nothing is chosen by looking at validation), ``best/`` (the one with the
-lowest validation error, should the last be worse), ``log.jsonl``, ``curve.png``, ``validation/`` (pictures of fixed views) and
-``tensorboard/``. The loop itself is ``model.renderformer.training.fit``; this module binds it to configs, artifacts and
-files. Started by ``torchrun``, the first process leads and the others follow.
+lowest validation error, should the last be worse), ``objects.json`` in both (`TrainingObjects`), ``log.jsonl``, ``curve.png``,
+``validation/`` (pictures of fixed views) and ``tensorboard/``. The loop itself is ``model.renderformer.training.fit``; this
+module binds it to configs, artifacts and files. Started by ``torchrun``, the first process leads and the others follow.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import itertools
 import json
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -32,7 +32,10 @@ if TYPE_CHECKING:
     from model.renderformer.network import RenderFormer
     from model.renderformer.training import FitConfig
     from model.training.parallel import Group
-    from pipeline.store import Draft
+    from pipeline.store import Artifact, Draft
+
+
+OBJECTS = "objects.json"  # beside a checkpoint: its training objects; of a shard artifact: those of all splits
 
 
 class ModelSection(Section):
@@ -161,7 +164,7 @@ class TrainConfig(StageConfig):
 
 class Train(RunStage):
     name = "train"
-    version = 3
+    version = 4
     inputs = ("shard",)
     Config = TrainConfig
 
@@ -172,7 +175,8 @@ class Train(RunStage):
         if config.init_from is None:
             return {}
         folder = initial_folder(config.init_from)
-        return {"init_from": {name: hash_file(folder / name) for name in ("config.json", "model.safetensors")}}
+        names = ["config.json", "model.safetensors", *([OBJECTS] if (folder / OBJECTS).is_file() else [])]
+        return {"init_from": {name: hash_file(folder / name) for name in names}}
 
     def estimate(self, config: TrainConfig, configs: Mapping[str, StageConfig]) -> list[str]:
         return estimate(config, configs)
@@ -183,9 +187,11 @@ class Train(RunStage):
         with join(choose_device(config.device, "train.device")) as group:
             group.tell(str(draft.state))
             summary = self._train(config, inputs, group, draft.state, draft.files, draft.log)
+        objects = training_objects(config, inputs["shard"])
         for name, where in (("last", "checkpoint"), ("best", "best")):
             if (draft.state / name).is_dir():
                 shutil.copytree(draft.state / name, draft.files / where, dirs_exist_ok=True)
+                objects.write(draft.files / where)
         rows = [json.loads(line) for line in (draft.state / "log.jsonl").read_text().splitlines()]
         (draft.files / "log.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
         plot_curve(rows, draft.files / "curve.png", f"{config.model.name}, {config.steps:,} steps")
@@ -220,6 +226,8 @@ class Train(RunStage):
         batches = Batches(train, config.batches(), group.rank, group.world)
         held_out = list(itertools.islice(evaluation_samples(validation), config.validation_scenes))
 
+        if config.init_from is not None:
+            check_objects(config, inputs["shard"], say)
         torch.manual_seed(config.seed)
         model = RenderFormer(config.model.build())
         start(model, config)
@@ -259,6 +267,66 @@ def initial_folder(reference: str) -> Path:
         f"train.init_from={reference} holds no checkpoint: give a folder with config.json and model.safetensors, or that of a "
         "finished train artifact (store/train/...)"
     )
+
+
+@dataclass(frozen=True)
+class TrainingObjects:
+    """Objects in the training scenes of a model, and of the models that it started from: ``objects.json`` beside its weights.
+
+    ``objects``: object id -> content hash of its mesh. ``complete``: False where the scenes do not say what they show, or a
+    model that it started from had no complete list.
+    """
+
+    objects: dict[str, str]
+    complete: bool = True
+
+    def write(self, folder: Path) -> None:
+        (folder / OBJECTS).write_text(json.dumps(asdict(self), indent=1, sort_keys=True) + "\n")
+
+    @classmethod
+    def read(cls, folder: Path) -> TrainingObjects:
+        """Of a checkpoint folder; empty and not complete where it has no list. UserError where the list is malformed."""
+        if not (folder / OBJECTS).is_file():
+            return cls({}, complete=False)
+        try:
+            found = json.loads((folder / OBJECTS).read_bytes())
+            return cls({str(id): str(content) for id, content in found["objects"].items()}, bool(found["complete"]))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise UserError(
+                f"{folder / OBJECTS} is no list of training objects ({error}): expected objects, complete"
+            ) from None
+
+
+def split_objects(shard: Artifact, split: str) -> dict[str, str]:
+    """Object id -> content hash, of the objects in the shards' scenes of a split."""
+    listed = json.loads(shard.file(OBJECTS).read_bytes()).get(split, {})
+    return {id: entry["content_hash"] for id, entry in listed.items()}
+
+
+def training_objects(config: TrainConfig, shard: Artifact) -> TrainingObjects:
+    """What the finished model has seen. Imported scenes do not say which objects they show, so their list is not complete."""
+    own = split_objects(shard, "train")
+    before = TrainingObjects({}) if config.init_from is None else TrainingObjects.read(initial_folder(config.init_from))
+    return TrainingObjects(before.objects | own, before.complete and bool(own))
+
+
+def check_objects(config: TrainConfig, shard: Artifact, say: Callable[[str], None]) -> None:
+    """Refuse to start from a model that was trained on objects of the test split. Content decides, as made-up objects have the
+    same ids for every seed."""
+    before = TrainingObjects.read(initial_folder(config.init_from))
+    seen = set(before.objects.values())
+    leaked = [id for id, content in sorted(split_objects(shard, "test").items()) if content in seen]
+    if leaked:
+        names = ", ".join([*leaked[:5], *["..."] * (len(leaked) > 5)])
+        raise UserError(
+            f"train.init_from={config.init_from} was trained on {len(leaked)} object(s) of the test split ({names}), so its "
+            "test would say nothing: start from another model or from scratch"
+        )
+    if not before.complete:
+        say(
+            f"warning: nobody knows all objects that train.init_from={config.init_from} was trained on ({OBJECTS} is missing "
+            "there or in what it started from): some may be in the test split"
+        )
 
 
 def start(model: RenderFormer, config: TrainConfig) -> None:

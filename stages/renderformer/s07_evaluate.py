@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from stages.renderformer.records import SceneRecord
 
 
+MEAN_IMAGES = "mean_images.npz"  # in the folder that all workers read
+
+
 class EvaluateConfig(StageConfig):
     split: Literal["test", "validation", "train"] = "test"
     baseline_views: int = Field(1024, ge=1)  # a mean of 1,024 is within 0.005 dB of the mean of all, in bounded memory
@@ -87,23 +90,20 @@ class Evaluate(MapStage):
         for scene_id in shard.ids(config.split):
             yield Item(scene_id, config.split)
 
+    def prepare(self, config: EvaluateConfig, inputs: Inputs, folder: Path) -> None:
+        """The mean training images: up to 1,024 views are read for them, and held as half floats."""
+        from pipeline.store.files import write_atomic
+        from stages.graphics.arrays import pack_arrays
+
+        write_atomic(folder / MEAN_IMAGES, pack_arrays(mean_training_images(config, inputs)))
+
     def open(self, config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any]) -> Worker:
-        import torch
+        return open_worker(config, inputs, environment, mean_training_images(config, inputs))
 
-        from stages.graphics.metrics import with_lpips
-        from stages.renderformer.evaluation.baselines import mean_images
-        from stages.renderformer.inference.predict import load_model
+    def open_prepared(self, config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any], folder: Path) -> Worker:
+        from stages.graphics.arrays import unpack_arrays
 
-        # Sums in another order round differently: one thread, so that a record is the same for any number of workers.
-        torch.set_num_threads(1)
-        return Worker(
-            config=config,
-            device=environment["device"],
-            model=load_model(inputs["train"].file("checkpoint")),
-            shard=inputs["shard"],
-            metrics=with_lpips(config.lpips, config.lpips_folder),
-            mean_images=mean_images(training_images(inputs["shard"], config.baseline_views), config.baseline_views),
-        )
+        return open_worker(config, inputs, environment, unpack_arrays((folder / MEAN_IMAGES).read_bytes()))
 
     def process(self, worker: Worker, item: Item) -> Iterator[Record]:
         import numpy as np
@@ -206,6 +206,33 @@ class Evaluate(MapStage):
 
     def check(self, draft: Draft) -> None:
         assert (draft.files / "report.html").is_file(), "evaluate wrote no report"
+
+
+def open_worker(
+    config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any], mean_images: dict[str, np.ndarray]
+) -> Worker:
+    import torch
+
+    from stages.graphics.metrics import with_lpips
+    from stages.renderformer.inference.predict import load_model
+
+    # Sums in another order round differently: one thread, so that a record is the same for any number of workers.
+    torch.set_num_threads(1)
+    return Worker(
+        config=config,
+        device=environment["device"],
+        model=load_model(inputs["train"].file("checkpoint")),
+        shard=inputs["shard"],
+        metrics=with_lpips(config.lpips, config.lpips_folder),
+        mean_images=mean_images,
+    )
+
+
+def mean_training_images(config: EvaluateConfig, inputs: Inputs) -> dict[str, np.ndarray]:
+    """Per space (H, W, 3), of about ``baseline_views`` training images."""
+    from stages.renderformer.evaluation.baselines import mean_images
+
+    return mean_images(training_images(inputs["shard"], config.baseline_views), config.baseline_views)
 
 
 def training_images(shard: Artifact, views: int) -> Iterator[np.ndarray]:

@@ -64,8 +64,15 @@ class RunProbe(MapStage):
         device = choose_device(config.device if previous is None else previous["device"], "probe.device")
         return {"device": device, "renderer": choose(config.backend, None if previous is None else previous["renderer"])}
 
+    def same_environment(self, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+        from stages.renderformer.rendering.backend import same
+
+        return one["device"] == other["device"] and same(one["renderer"], other["renderer"])
+
     def max_workers(self, config: ProbeConfig, environment: dict[str, Any]) -> int | None:
-        return 1 if environment["device"] == "cuda" else None
+        from stages.renderformer.rendering.backend import max_workers
+
+        return 1 if environment["device"] == "cuda" else max_workers(environment["renderer"])
 
     def items(self, config: ProbeConfig, inputs: Inputs) -> Iterator[Item]:
         yield from PROBES[config.name].items(config, inputs)

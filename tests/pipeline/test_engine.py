@@ -20,7 +20,7 @@ from pipeline.run import run_pipeline
 from pipeline.stage import Record
 from pipeline.store import Store
 from pipeline.sweep import plan_of
-from tests.pipeline.toy import Squares
+from tests.pipeline.toy import Numbers, Squares
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -117,6 +117,20 @@ def test_more_items_compute_only_the_new_ones(run, tmp_path):
     assert sorted(log.read_text().split()) == ["n010", "n011", "n012", "n014"]  # n013 is rejected upstream
     fresh, _ = run(numbers={"n": 15}, store=str(tmp_path / "fresh"))
     assert contents(grown) == contents(fresh)
+
+
+def test_growth_takes_over_what_a_like_environment_made(run, tmp_path, monkeypatch):
+    """The stage says which environments are alike: a library's small upgrade, say."""
+    tool = ["1.1"]
+    monkeypatch.setattr(Numbers, "environment", lambda self, config, previous: {"tool": tool[-1]})
+    run(numbers={"n": 6})
+    monkeypatch.setattr(Numbers, "same_environment", lambda self, one, other: one["tool"][0] == other["tool"][0])
+    for version, n, computed in (("1.2", 8, 2), ("2.0", 10, 10), ("1.3", 12, 4)):
+        tool.append(version)
+        log = tmp_path / f"{version}.log"
+        artifacts, _ = run(numbers={"n": n, "log_to": str(log)})
+        assert len(log.read_text().splitlines()) == computed, version
+        assert artifacts["numbers"].manifest["environment"] == {"tool": version}
 
 
 def test_one_changed_parameter_reruns_its_stage_and_what_follows(run):

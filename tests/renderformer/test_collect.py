@@ -356,19 +356,72 @@ def some(number: int) -> list[dict]:
     return [{"object_id": f"o{i}", "content_hash": blake(str(i).encode())} for i in range(number)]
 
 
-@pytest.mark.parametrize("number", [6, 7, 20, 25, 101])
-def test_splits_hold_their_share(number: int) -> None:
+@pytest.mark.parametrize("number", [6, 7, 20, 25, 101, 2000])
+def test_every_split_has_objects_and_large_sets_a_tenth_of_them(number: int) -> None:
     splits = catalogue.fill_splits(some(number), {})
-    least = max(2, -(-number // 10))
     counts = {name: list(splits.values()).count(name) for name in catalogue.SPLITS}
-    assert len(splits) == number and min(counts.values()) >= least and counts["test"] == counts["validation"] == least
+    assert len(splits) == number and min(counts.values()) >= 2
+    assert number < 2000 or all(0.08 < counts[name] / number < 0.12 for name in ("test", "validation"))
     assert splits == catalogue.fill_splits(some(number)[::-1], {})
 
 
+TOWARDS_TRAIN = {name: place for place, name in enumerate(("test", "validation", "train"))}
+
+
+@pytest.mark.parametrize("held_share", [0.0, 0.1])
+def test_growth_moves_no_object_towards_the_test(held_share: float) -> None:
+    """Random sets that grow: objects only leave a split that they filled up, and nothing moves once none is."""
+    filled_up = moved = 0
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        objects = [{"object_id": f"o{i}", "content_hash": rng.bytes(32).hex()} for i in range(200)]
+        fraction = {o["object_id"]: catalogue.hash_fraction(o["content_hash"]) for o in objects}
+        held = {o["object_id"]: ("test", "validation")[i % 2] for i, o in enumerate(objects) if rng.random() < held_share}
+        before, settled = {}, False
+        for number in np.cumsum(rng.integers(1, 12, 40)):
+            inside = objects[: 5 + number]
+            present = {o["object_id"]: held[o["object_id"]] for o in inside if o["object_id"] in held}
+            try:
+                splits = catalogue.fill_splits(inside, present)
+            except UserError:
+                assert not before  # what was enough is enough for ever
+                continue
+            assert all(splits[name] == split for name, split in present.items())
+            for name, split in before.items():
+                assert TOWARDS_TRAIN[splits[name]] >= TOWARDS_TRAIN[split]
+                if splits[name] != split:
+                    moved += 1
+                    assert not settled and name not in held and fraction[name] >= catalogue.BOUNDS[split]
+            by_hash = {n: next((s for s, b in catalogue.BOUNDS.items() if fraction[n] < b), "train") for n in splits}
+            settled = settled or all(splits[n] == by_hash[n] for n in splits if n not in held)
+            filled_up += not settled
+            before = splits
+    assert filled_up and moved
+
+
+def test_a_folder_that_grows_keeps_its_splits() -> None:
+    small, large = (catalogue.fill_splits(some(number), {}) for number in (40, 400))
+    assert all(large[name] == split for name, split in small.items())
+
+
+def test_a_duplicate_that_takes_an_objects_place_cannot_bring_it_to_the_test() -> None:
+    """The file that sorts first stands for a surface; all files of that surface decide."""
+    objects = some(100)
+    splits = catalogue.fill_splits(objects, {})
+    low = min(objects, key=lambda o: o["content_hash"])
+    trained = next(o for o in objects if splits[o["object_id"]] == "train")
+    new = {"object_id": "new", "content_hash": "0" + low["content_hash"][1:]}
+    replaced = [new if o is trained else o for o in objects]
+    assert catalogue.fill_splits(replaced, {})["new"] == "test"
+    assert catalogue.fill_splits(replaced, {}, {"new": [trained["content_hash"]]})["new"] == "train"
+
+
 def test_held_out_objects_keep_their_split() -> None:
-    splits = catalogue.fill_splits(some(30), {f"o{i}": "test" for i in range(8)} | {"o9": "validation"})
-    assert all(splits[f"o{i}"] == "test" for i in range(8)) and splits["o9"] == "validation"
-    assert list(splits.values()).count("test") == 8 and list(splits.values()).count("validation") == 3
+    held = {f"o{i}": "test" for i in range(8)} | {"o9": "validation"}
+    splits = catalogue.fill_splits(some(30), held)
+    assert held.items() <= splits.items()
+    others = catalogue.fill_splits(some(30), {})
+    assert all(splits[name] == split for name, split in others.items() if name not in held)
 
 
 @pytest.mark.parametrize("number", [0, 1, 5])

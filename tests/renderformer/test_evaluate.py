@@ -396,6 +396,21 @@ def test_a_diverged_model_stops_the_run(inputs, predictor, tmp_path):
         evaluate(EvaluateConfig(), inputs, tmp_path / "out")
 
 
+def test_workers_read_the_mean_image_that_was_built_once(inputs, predictor, tmp_path, monkeypatch):
+    import stages.renderformer.s07_evaluate as module
+
+    stage, config, tmp = Evaluate(), EvaluateConfig(), tmp_path / "prepared"
+    for _ in range(2):  # a run that continues prepares again
+        stage.prepare(config, inputs, tmp)
+    assert [path.name for path in tmp.iterdir()] == ["mean_images.npz"]
+    alone = stage.open(config, inputs, {"device": "cpu"})
+    monkeypatch.setattr(module, "training_images", None)  # no worker may read the training images
+    worker = stage.open_prepared(config, inputs, {"device": "cpu"}, tmp)
+    item = next(iter(stage.items(config, inputs)))
+    (one,), (other,) = (list(stage.process(opened, item)) for opened in (alone, worker))
+    assert one.members == other.members
+
+
 def test_mean_image_sees_training_scenes_only_and_about_as_many_as_asked(inputs):
     assert sum(len(block) for block in training_images(inputs["shard"], 1000)) == 24
     assert sum(len(block) for block in training_images(inputs["shard"], 8)) == 8

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import shutil
 
@@ -93,6 +95,47 @@ def test_the_key_is_that_of_the_content(folder, tmp_path):
     (tmp_path / "copy" / "train" / "mesh.obj").write_text(MESH.replace("v 1 0 0", "v 2 0 0"))
     after = keys(tmp_path / "copy")
     assert after["scene"] != before["scene"] and after["render"] != before["render"]
+
+
+def test_the_key_follows_every_file_that_a_mesh_names(tmp_path):
+    """Buffers and images of a glTF, libraries and images of an OBJ, the image of a PLY; what is opened, and nothing else."""
+    import trimesh
+
+    (tmp_path / "maps").mkdir()
+    mesh = trimesh.load(io.StringIO(MESH), file_type="obj")
+    for name, data in mesh.export(file_type="gltf").items():
+        (tmp_path / name.replace("model", "solid")).write_bytes(data)
+    tree = json.loads((tmp_path / "solid.gltf").read_bytes())
+    (tmp_path / tree["buffers"][0]["uri"]).rename(tmp_path / "solid.dat")
+    tree["buffers"] = [{"uri": "solid.dat", "byteLength": (tmp_path / "solid.dat").stat().st_size}]
+    tree["bufferViews"] = [view | {"buffer": 0} for view in tree["bufferViews"]]
+    tree["images"] = [{"uri": "/maps/a.png"}, {"uri": "data:image/png;base64,AA=="}, {"uri": "missing.png"}]
+    (tmp_path / "solid.gltf").write_text(json.dumps(tree))
+    (tmp_path / "solid.obj").write_text("mtllib colours.lib\n" + MESH)
+    (tmp_path / "colours.lib").write_text("newmtl a\nmap_Kd maps/b.png\n")
+    ply = mesh.export(file_type="ply")
+    (tmp_path / "solid.ply").write_bytes(ply.replace(b"end_header", b"comment TextureFile c.tif\nend_header", 1))
+    beside = {"solid.gltf": ["solid.dat", "maps/a.png"], "solid.obj": ["colours.lib", "maps/b.png"], "solid.ply": ["c.tif"]}
+    for name in ("maps/a.png", "maps/b.png", "c.tif"):
+        (tmp_path / name).write_bytes(b"picture")
+    (tmp_path / "unrelated.bin").write_bytes(b"1")
+    stage, config = ImportScene(), ImportConfig(path=str(tmp_path))
+
+    def identity() -> dict:
+        return stage.identity(config, lambda path: hashlib.sha256(path.read_bytes()).hexdigest())
+
+    for mesh_name, files in beside.items():
+        (tmp_path / "one.json").write_text(scene_json().replace("mesh.obj", mesh_name))
+        load_scene(tmp_path / "one.json")  # the mesh is one that can be read
+        for file in (mesh_name, *files):
+            before, content = identity(), (tmp_path / file).read_bytes()
+            (tmp_path / file).write_bytes(content + b" ")
+            assert identity() != before, file
+            (tmp_path / file).write_bytes(content)
+            assert identity() == before
+        before = identity()
+        (tmp_path / "unrelated.bin").write_bytes(b"2" if mesh_name == "solid.obj" else b"3")
+        assert identity() == before
 
 
 def test_imported_scenes_are_rendered_and_sharded_like_any_other(folder, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,9 +15,10 @@ from stages.graphics.arrays import pack_json, unpack_json
 from stages.graphics.metrics import log_error, psnr
 from stages.graphics.tonemap import clamp
 from stages.renderformer.records import ViewRecord
-from stages.renderformer.rendering import noise, sheet
+from stages.renderformer.rendering import backend, noise, sheet
 from stages.renderformer.rendering.render import render_views
 from stages.renderformer.s04_render import Render, RenderConfig
+from stages.renderformer.s08_probe import RunProbe
 from stages.renderformer.views import decode_view, encode_view, view_members
 from tests.renderformer.fakes import FakeArtifact
 from tests.renderformer.test_rendering import SCALAR, camera, clutter
@@ -77,6 +79,77 @@ def test_an_interrupted_artifact_keeps_its_backend():
     assert stage.environment(RenderConfig(), SCALAR) == SCALAR
     with pytest.raises(UserError, match="begun with the backend llvm with /none"):
         stage.environment(RenderConfig(), {"backend": "llvm", "library": "/none/libLLVM.so"})
+
+
+@pytest.fixture
+def libraries(tmp_path, monkeypatch):
+    """libraries("lib/libLLVM.so.19.1", ..): what this machine has of LLVM, in order; -> their paths. All of them work."""
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    monkeypatch.setattr(backend, "_proof", lambda candidate: True)
+    monkeypatch.setattr(backend, "gpus", lambda: [])
+
+    def install(*names: str) -> list[str]:
+        paths = [tmp_path / name for name in names]
+        for path in paths:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(b"")
+        monkeypatch.setattr(backend, "llvm_libraries", lambda: [str(path) for path in paths])
+        return [str(path) for path in paths]
+
+    return install
+
+
+def test_an_upgrade_of_llvm_within_its_major_version_changes_nothing(libraries):
+    """Drafts are finished and earlier artifacts taken over; those that name LLVM by path too."""
+    stage, config = Render(), RenderConfig()
+    old = libraries("a/libLLVM.so.19.1")
+    begun = stage.environment(config, None)
+    assert begun == {"backend": "llvm", "llvm": 19}
+    by_path = {"backend": "llvm", "library": old[0]}
+    os.remove(old[0])
+    new = libraries("b/libLLVM.so.20.1", "b/libLLVM-19.1.7.so", "b/libLLVM.so.19.0")
+    for environment in (begun, by_path):
+        assert stage.environment(config, environment) == begun  # finished with 19 although 20 would be chosen
+        assert stage.same_environment(environment, begun) and stage.same_environment(begun, environment)
+        assert not stage.same_environment(environment, stage.environment(config, None))
+    assert stage.environment(config, None) == {"backend": "llvm", "llvm": 20}
+    assert backend.llvm_library(begun) == backend.llvm_library(by_path) == new[1]
+    assert backend.candidates("llvm") == [{"backend": "llvm", "llvm": number} for number in (20, 19)]
+    libraries("c/libLLVM-18.so.1")
+    with pytest.raises(UserError, match="begun with the backend llvm with LLVM 19"):
+        stage.environment(config, by_path)
+    with pytest.raises(UserError, match="LLVM 19 is not on this machine"):
+        backend.activate(begun)
+    probe = RunProbe()
+    assert probe.same_environment({"device": "cpu", "renderer": begun}, {"device": "cpu", "renderer": by_path})
+    assert not probe.same_environment({"device": "cpu", "renderer": begun}, {"device": "cuda", "renderer": begun})
+
+
+def test_the_version_of_a_library_is_read_off_its_path(libraries):
+    names = {
+        "x/libLLVM-14.so.1": 14, "x/libLLVM.so.19.1": 19, "x/libLLVM-15.0.7.so": 15, "llvm-17/lib/libLLVM.so": 17,
+        "Cellar/llvm/20.1.8/lib/libLLVM.dylib": 20, "llvm@16/lib/libLLVM.dylib": 16,
+    }  # fmt: skip
+    for path, version in zip(libraries(*names), names.values(), strict=True):
+        assert backend.llvm_backend(path) == {"backend": "llvm", "llvm": version}
+    (plain,) = libraries("own/libLLVM.so")
+    assert Render().environment(RenderConfig(), None) == {"backend": "llvm", "library": plain}
+
+
+@pytest.mark.parametrize("visible, number", [(["GPU-a", "GPU-b"], 2), (["GPU-a"], 1), ([], 1)])
+def test_one_process_renders_on_each_gpu(monkeypatch, visible, number):
+    """Each claims a GPU of its own: test_rendering.py."""
+    monkeypatch.setattr(backend, "gpus", lambda: visible)
+    assert Render().max_workers(RenderConfig(), {"backend": "cuda"}) == number
+    for other in (SCALAR, {"backend": "llvm", "llvm": 19}):
+        assert Render().max_workers(RenderConfig(), other) is None
+    for device, renderer, most in (
+        ("cpu", "cuda", number),
+        ("cuda", "cuda", 1),
+        ("cuda", "scalar", 1),
+        ("cpu", "scalar", None),
+    ):
+        assert RunProbe().max_workers(None, {"device": device, "renderer": {"backend": renderer}}) == most
 
 
 def test_summary_tells_samples_errors_and_the_noise_floor(tmp_path, capsys):

@@ -114,6 +114,40 @@ def test_a_second_run_starts_from_the_first_ones_weights(trained, shard, tmp_pat
         train_on(shard, tmp_path / "third", init_from=str(first), model=MODEL | {"dim_feedforward": 32})
 
 
+def test_a_model_trained_on_test_objects_is_no_start(trained, shard, tmp_path):
+    """Its list of training objects, with those of the models that it started from, lies beside its weights."""
+    first = trained[0].files / "checkpoint"
+    known = json.loads(shard.file("objects.json").read_text())
+    listed = json.loads((first / "objects.json").read_text())
+    assert listed == {"objects": {id: o["content_hash"] for id, o in known["train"].items()}, "complete": True}
+    assert listed["objects"] and (trained[0].files / "best" / "objects.json").is_file()
+    load_model(first)  # the list is none of the format's business
+
+    other = tmp_path / "other"
+    shutil.copytree(first, other)
+
+    def start_from(number: int, **listed):
+        (other / "objects.json").write_text(json.dumps({"objects": {}, "complete": True} | listed))
+        return train_on(shard, tmp_path / str(number), init_from=str(other), steps=1)
+
+    tested, content = next((id, o["content_hash"]) for id, o in known["test"].items())
+    with pytest.raises(UserError, match=rf"trained on 1 object\(s\) of the test split \({tested}\)"):
+        start_from(0, objects={"another-name": content})
+    draft, said = start_from(1, objects={tested: "of another seed", "old": "from before"})
+    assert not any("warning" in line for line in said)
+    kept = json.loads((draft.files / "checkpoint" / "objects.json").read_text())
+    assert kept == {"objects": {**listed["objects"], tested: "of another seed", "old": "from before"}, "complete": True}
+    draft, said = start_from(2, complete=False)
+    assert any("some may be in the test split" in line for line in said)
+    (other / "objects.json").unlink()
+    draft, said = train_on(shard, tmp_path / "3", init_from=str(other), steps=1)
+    assert any("some may be in the test split" in line for line in said)
+    assert not json.loads((draft.files / "checkpoint" / "objects.json").read_text())["complete"]
+    (other / "objects.json").write_text("[]")
+    with pytest.raises(UserError, match="no list of training objects"):
+        train_on(shard, tmp_path / "4", init_from=str(other), steps=1)
+
+
 def test_killed_at_any_step_and_resumed_is_the_same_run(shard, tmp_path, monkeypatch):
     """Through the real loader; checks/kills.py does it with real kills."""
     import stages.renderformer.dataset

@@ -1,17 +1,15 @@
 """What is decided over all objects at once: record ids, duplicates, splits, and what a folder says about its files'
 licences.
 
-Split rule: validation and test hold at least max(2, 10 %) of the objects each, and so does train. Families that are
-held out go whole to their split; the rest of the need is met in order of content hash, so that the choice does not
-depend on names or order.
+Split rule (``fill_splits``): a fraction in [0, 1) made of an object's content hash says its split, so that the choice depends
+on no name, no order and no other object. Families that are held out go whole to their split.
 """
 
 from __future__ import annotations
 
 import hashlib
-import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -20,6 +18,8 @@ import numpy as np
 from pipeline.errors import UserError
 
 SPLITS = ("train", "validation", "test")
+BOUNDS = {"test": 0.1, "validation": 0.2}  # an object goes to the first split whose bound its fraction is under, else to train
+LEAST = 2  # objects that every split has
 SIGNATURE_TOLERANCE = 2e-3  # candidates for duplicates: every number of the signature agrees to this
 POINT_TOLERANCE = 5e-4  # of the longest side: confirmed when the surfaces agree to this
 
@@ -30,25 +30,55 @@ def record_id(item_id: str, stem: str) -> str:
     return f"{slug}-{hashlib.blake2b(item_id.encode(), digest_size=4).hexdigest()}"
 
 
-def fill_splits(objects: list[dict[str, Any]], held: Mapping[str, str]) -> dict[str, str]:
-    """object_id -> split. ``held`` places some objects already; the others fill test, then validation, by rank of hash.
+def hash_fraction(content_hash: str) -> float:
+    """A hex digest as a number in [0, 1), from its first 52 bits."""
+    return int(content_hash[:13], 16) / 16**13
 
-    Raises UserError where the objects do not suffice.
+
+def fill_splits(
+    objects: list[dict[str, Any]], held: Mapping[str, str], duplicates: Mapping[str, Iterable[str]] | None = None
+) -> dict[str, str]:
+    """object_id -> split. ``held`` places some objects already; hash fractions place the others, by ``BOUNDS``.
+
+    Where a split then has fewer than ``LEAST``, the objects of the next higher fractions fill it up: first test, then
+    validation. ``duplicates``: object_id -> content hashes of the meshes left out for it. The highest fraction counts.
+
+    What holds when a set grows, with the same families held out:
+
+    - No object moves towards the test: none from train to validation or test, none from validation to test.
+    - Only an object that filled a split up moves, from test to validation or train, or from validation to train.
+    - Once each split has ``LEAST`` objects without filling up, no object ever moves again.
+
+    The reason: an object's place in the order of fractions rises by the number of new objects below it, and the ends of test
+    and validation in that order rise by no more than that. No rule can do better from the objects alone: objects that never
+    move could not be in train in any set of six, since two of every six must be test.
+
+    A new duplicate can only raise its object's fraction, so that object moves towards train if at all. While a split is
+    filled up, that can pull another object into it.
+
+    Raises UserError where a split stays under ``LEAST``.
     """
     number = len(objects)
-    least = max(2, math.ceil(0.1 * number))
     splits = {name: split for name, split in held.items() if split != "train"}
-    free = [o["object_id"] for o in sorted(objects, key=lambda o: o["content_hash"]) if o["object_id"] not in splits]
-    for split in ("test", "validation"):
-        while list(splits.values()).count(split) < least and free:
-            splits[free.pop(0)] = split
-    splits.update(dict.fromkeys(free, "train"))
+    fractions = {
+        o["object_id"]: max(hash_fraction(h) for h in (o["content_hash"], *(duplicates or {}).get(o["object_id"], ())))
+        for o in objects
+        if o["object_id"] not in splits
+    }
+    free = sorted(fractions, key=lambda name: (fractions[name], name))
+    end = 0
+    for split, bound in BOUNDS.items():
+        missing = max(0, LEAST - list(splits.values()).count(split))
+        start, end = end, max(end + missing, sum(fraction < bound for fraction in fractions.values()))
+        splits.update(dict.fromkeys(free[start:end], split))
+    splits.update(dict.fromkeys(free[end:], "train"))
     counts = {split: list(splits.values()).count(split) for split in SPLITS}
-    if min(counts.values()) < least:
+    if min(counts.values()) < LEAST:
         stated = ", ".join(f"{counts[split]} {split}" for split in SPLITS)
+        uneven = ", and the hashes of so few are uneven" if number >= 3 * LEAST else ""
         raise UserError(
-            f"{number} distinct usable meshes ({stated}): train, validation and test need at least {least} each, "
-            f"so at least {max(3 * least, 6)} in all{' and fewer held out' if number >= 3 * least else ''}; add meshes"
+            f"{number} distinct usable meshes ({stated}): train, validation and test need at least {LEAST} each, so at least "
+            f"{3 * LEAST} in all{uneven}; add meshes{' or hold out fewer families' if held else ''}"
         )
     return splits
 

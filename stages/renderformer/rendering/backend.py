@@ -2,7 +2,8 @@
 
 A JIT compiler that does not fit the machine aborts the whole process (libLLVM 14 and 15 on recent CPUs), so each
 candidate proves itself in a child process that renders a tiny scene with the integrator of this package. The answer
-is plain JSON, which the render stage records and passes to its workers.
+is plain JSON, which the render stage records and passes to its workers: ``{"backend": "llvm", "llvm": 19}``. It names LLVM
+by its major version, not by path: a path changes with every small upgrade and from machine to machine.
 """
 
 from __future__ import annotations
@@ -64,6 +65,40 @@ def llvm_libraries() -> list[str]:
     return ([named] if named else []) + [path for path in ordered if path != named]
 
 
+def llvm_version(path: str) -> int | None:
+    """The major version that the path of a libLLVM names (libLLVM-15.so.1, libLLVM.so.19.1, llvm-19/lib/libLLVM.so); the
+    links of a file that is there are followed. None where none does."""
+    real = os.path.realpath(path)
+    found = re.search(r"\d+", os.path.basename(real)) or re.search(r"(?<=llvm[-@/])\d+", real)
+    return int(found[0]) if found else None
+
+
+def llvm_backend(path: str) -> dict[str, Any]:
+    """The backend of a libLLVM: by major version, or by path where that names none."""
+    version = llvm_version(path)
+    return {"backend": "llvm", "library": path} if version is None else {"backend": "llvm", "llvm": version}
+
+
+def by_version(backend: dict[str, Any]) -> dict[str, Any]:
+    """The backend as it is recorded now: artifacts that are older name LLVM by path."""
+    return llvm_backend(backend["library"]) if backend.get("library") else backend
+
+
+def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    """Whether two recorded backends may make one artifact."""
+    return by_version(a) == by_version(b)
+
+
+def llvm_library(backend: dict[str, Any]) -> str | None:
+    """The path of libLLVM for an LLVM backend, on this machine; None where there is none."""
+
+    def suits(path: str) -> bool:
+        return os.path.isfile(path) and llvm_backend(path) == by_version(backend)
+
+    named = os.environ.get("DRJIT_LIBLLVM_PATH", "")
+    return named if suits(named) else next(filter(suits, llvm_libraries()), None)
+
+
 def gpus() -> list[str]:
     """NVIDIA GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
@@ -104,7 +139,8 @@ def candidates(choice: str) -> list[dict[str, Any]]:
     if choice in ("auto", "cuda") and gpus():
         found.append({"backend": "cuda"})
     if choice in ("auto", "llvm"):
-        found += [{"backend": "llvm", "library": path} for path in llvm_libraries()]
+        libraries = [llvm_backend(path) for path in llvm_libraries() if os.path.isfile(path)]
+        found += [backend for number, backend in enumerate(libraries) if backend not in libraries[:number]]
     if choice in ("auto", "scalar"):
         found.append({"backend": "scalar"})
     return found
@@ -112,6 +148,8 @@ def candidates(choice: str) -> list[dict[str, Any]]:
 
 def works(candidate: dict[str, Any]) -> bool:
     """True if a child process renders the tiny scene with this backend. The scalar one needs no proof."""
+    if candidate["backend"] == "llvm" and llvm_library(candidate) is None:
+        return False
     return candidate["backend"] == "scalar" or _proof(json.dumps(candidate, sort_keys=True))
 
 
@@ -133,13 +171,14 @@ def _proof(candidate: str) -> bool:
 
 
 def choose(choice: str = "auto", previous: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The backend to render with, as plain JSON: ``{"backend": ..., "library": path of libLLVM}``.
+    """The backend to render with, as plain JSON: ``{"backend": ..., "llvm": major version of libLLVM}``.
 
     ``previous`` is what an interrupted artifact was begun with: it is kept, as another one gives other bytes.
     """
     if choice not in CHOICES:
         raise UserError(f"backend={choice!r} is unknown: choose from {', '.join(CHOICES)}")
     if previous:
+        previous = by_version(previous)
         if works(previous):
             return previous
         raise UserError(
@@ -156,13 +195,21 @@ def choose(choice: str = "auto", previous: dict[str, Any] | None = None) -> dict
 
 
 def _title(backend: dict[str, Any]) -> str:
-    return " with ".join(str(value) for _, value in sorted(backend.items()))
+    return " with ".join(f"LLVM {value}" if name == "llvm" else str(value) for name, value in sorted(backend.items()))
+
+
+def max_workers(backend: dict[str, Any]) -> int | None:
+    """At most this many processes render at a time: one for each GPU that this process may use; None for any number."""
+    return max(1, len(gpus())) if backend["backend"] == "cuda" else None
 
 
 def activate(backend: dict[str, Any], threads: int | None = None) -> None:
     """Select the backend's Mitsuba variant in this process, with that many threads (None: all cores)."""
-    if backend.get("library"):
-        os.environ["DRJIT_LIBLLVM_PATH"] = backend["library"]  # read once, when Dr.Jit first compiles
+    if backend["backend"] == "llvm":
+        library = llvm_library(backend)
+        if library is None:
+            raise UserError(f"the backend {_title(backend)} is not on this machine: {INSTALL}, or set DRJIT_LIBLLVM_PATH")
+        os.environ["DRJIT_LIBLLVM_PATH"] = library  # read once, when Dr.Jit first compiles
     if backend["backend"] == "cuda" and threads is not None:  # in a worker: others use the other GPUs
         claim_gpu()
     mitsuba = importlib.import_module("mitsuba")

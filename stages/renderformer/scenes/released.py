@@ -13,12 +13,14 @@ reading: the last two axes are row and column as ``SceneRecord.patches`` says.
 from __future__ import annotations
 
 import json
+import re
+import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.errors import UserError
+from pipeline.errors import Reject, UserError
 from stages.renderformer.records import PATCH_CHANNELS, PATCH_KEPT, PATCH_SIDE, TEXTURED_CHANNELS, SceneRecord, patch_means
 
 CREASE_DEG = 30.0
@@ -182,6 +184,43 @@ def _mesh(folder: Path, entry: dict[str, Any], smooth: bool, where: str) -> tupl
         return triangles, flat, groups
     length = np.linalg.norm(normals, axis=2, keepdims=True)
     return triangles, np.where(length > 0.5, normals / np.maximum(length, 1e-12), flat), groups
+
+
+def files_beside(mesh: Path) -> list[Path]:
+    """The files that trimesh opens besides a mesh file: buffers and images of a glTF, the material library of an OBJ and
+    its images, the image of a PLY. Sorted; [] where the mesh cannot be read."""
+    from stages.graphics.geometry.load import split_glb
+
+    folder, kind, found = mesh.parent.resolve(), mesh.suffix.lower(), set()
+
+    def add(name: str) -> list[Path]:
+        """The files that a name can mean: trimesh tries it as written, then relative, then its last part."""
+        tries = (name.strip(), name.strip().lstrip("/"), name.strip().rpartition("/")[2])
+        files = {(folder / attempt).resolve() for attempt in tries if "\0" not in attempt}
+        files = {file for file in files if file.is_relative_to(folder) and file.is_file()}
+        found.update(files)
+        return sorted(files)
+
+    def text(pattern: bytes, data: bytes) -> list[str]:
+        return [match.decode("utf-8", "replace") for match in re.findall(pattern, data, flags=re.MULTILINE | re.IGNORECASE)]
+
+    try:
+        data = mesh.read_bytes()
+        if kind in (".gltf", ".glb"):
+            tree = split_glb(data)[0] if kind == ".glb" else json.loads(data)
+            for entry in (*tree.get("buffers", ()), *tree.get("images", ())):
+                if "base64," not in entry.get("uri", "base64,"):
+                    add(entry["uri"])
+        elif kind == ".obj":
+            for library in [file for name in text(rb"mtllib(.*)$", data) for file in add(name)]:
+                for name in text(rb"map_kd(.*)$", library.read_bytes()):
+                    add(name)
+        elif kind == ".ply":
+            for name in text(rb"TextureFile(.*)$", data[: data.find(b"end_header")]):
+                add(name)
+    except (Reject, OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, struct.error):
+        pass  # the scene is rejected when it is read
+    return sorted(found)
 
 
 def _scale(transform: dict[str, Any], where: str) -> np.ndarray:
