@@ -423,7 +423,8 @@ def test_what_an_earlier_gc_left_half_deleted_is_no_artifact(run, tmp_path):
     store, numbers = Store(tmp_path / "store"), artifacts["numbers"]
     aside = numbers.path.with_name(f".gone-{numbers.path.name}")
     numbers.path.rename(aside)
-    (artifacts["squares"].path / ".gone-markers").mkdir()
+    half = store.root / "squares" / artifacts["squares"].path.name / ".gone-markers"  # then there were no systems' folders
+    half.mkdir(parents=True)
     aside.with_name(f".gone-{numbers.key}.partial").mkdir()
     assert store.find("numbers", numbers.key) is None and store.drafts() == []
     assert {path.name for path, _ in store.garbage(days=14)} == {
