@@ -65,7 +65,7 @@ sweep: setup
 	@$(RUN) -m stages.cli sweep $(TABLE) $(ARGS)
 
 test: setup
-	@$(RUN) -m pytest $(TESTS)
+	@$(RUN) -m pytest -n auto --dist loadfile --durations=10 $(TESTS)
 
 lint: setup
 	@$(RUN) -m ruff check .

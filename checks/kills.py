@@ -32,7 +32,8 @@ from typing import Any
 
 import psutil
 
-from pipeline.store import Store
+from pipeline.store import Store  # noqa: E402
+from pipeline.store.folder import PLACES
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = (
@@ -60,7 +61,7 @@ class Campaign:
     """What is killed: a command over a store, and the first stage that it makes anew in each round."""
 
     command: Callable[[Path], list[str]]
-    stages: tuple[str, ...]  # made anew in each round; others are taken from the undisturbed run
+    stages: tuple[str, ...]  # their places in a store; made anew in each round; others are taken from the undisturbed run
     begun: str = " running "  # in the output: from here on there is something to lose
     moments: dict[str, int] = field(default_factory=lambda: PARTS)
 
@@ -93,7 +94,7 @@ def synthetic(store: Path) -> list[str]:
 
 
 CAMPAIGNS = {
-    "synthetic": Campaign(synthetic, ("numbers", "squares", "total")),
+    "synthetic": Campaign(synthetic, ("toy/numbers", "toy/squares", "toy/total")),
     "data": line("shard", DATA, ("collect", "remesh", "decimate", "scene", "render", "shard")),
     "train": line("train", (*DATA, *TRAIN), ("train",), begun="parameters (", moments=CHECKPOINTS),
 }
@@ -152,9 +153,14 @@ def rows(path: Path) -> list[dict]:
     return found
 
 
+def inside(store: Path, pattern: str) -> list[Path]:
+    """What matches in any place of the store."""
+    return [path for place in PLACES for path in store.glob(f"{place}/{pattern}")]
+
+
 def draft_of(store: Path) -> Path | None:
     """The draft at work: of several (one that another stage left) the newest."""
-    found = sorted(store.glob("[!.]*/*.partial"), key=lambda path: path.stat().st_mtime)
+    found = sorted(inside(store, "*.partial"), key=lambda path: path.stat().st_mtime)
     return found[-1] if found else None
 
 
@@ -180,13 +186,13 @@ def where(store: Path) -> str:
 def finished(store: Path) -> dict[tuple[str, str], int]:
     """(stage, file) -> inode, of every part with a marker and every manifest of an artifact: what must not be made again."""
     found = {}
-    for marker in store.glob("[!.]*/*.partial/markers/[!.]*.json"):
+    for marker in inside(store, "*.partial/markers/[!.]*.json"):
         with contextlib.suppress(OSError, ValueError):
             digest = json.loads(marker.read_bytes())["digest"]
             if digest is not None:
                 path = marker.parents[1] / "parts" / f"{digest}.tar"
                 found[path.parents[2].name, path.name] = path.stat().st_ino
-    for manifest in store.glob("[!.]*/*-*/manifest.json"):
+    for manifest in inside(store, "*-*/manifest.json"):
         found[manifest.parents[1].name, manifest.name] = manifest.stat().st_ino
         for path in manifest.parent.glob("parts/*.tar"):
             found[path.parents[2].name, path.name] = path.stat().st_ino
@@ -280,7 +286,8 @@ class Striker:
             arrived = run.wait_until(lambda: time.monotonic() - began > delay)
         else:
             stage = self.random.choice(
-                [name for name in self.campaign.stages if not list(run.store.glob(f"{name}/*-*"))] or ["*"]
+                [name for name in self.campaign.stages if not list(run.store.glob(f"{name}/*-*"))]
+                or [str(Path(self.campaign.stages[0]).with_name("*"))]
             )
             moments = self.campaign.moments
             pattern = self.random.choice(list(moments))
@@ -324,8 +331,8 @@ class Striker:
             whole = rows(Store(self.calm).resolve("train").file("log.jsonl"))[-1]["step"]
             done = [row["step"] for row in rows(logs[0])] if logs else []
             return 1 - (max(done, default=0) / whole)
-        whole = len(list(self.calm.glob("[!.]*/*/parts/*.tar")))
-        return max(0.1, 1 - len(list(store.glob("[!.]*/*/parts/*.tar"))) / whole)
+        whole = len(inside(self.calm, "*/parts/*.tar"))
+        return max(0.1, 1 - len(inside(store, "*/parts/*.tar")) / whole)
 
 
 def undisturbed(campaign: Campaign, store: Path) -> tuple[float, float]:

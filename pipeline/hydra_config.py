@@ -23,7 +23,8 @@ from pipeline.config import nearest
 from pipeline.errors import UserError
 from pipeline.stage import System, load_system
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
+HERE = Path(__file__).resolve().parent
+CONF = HERE / "conf" if (HERE / "conf").is_dir() else HERE.parent / "conf"  # of an installed package, of a checkout
 DEFAULT_SYSTEM = "renderformer"
 SYSTEM_WORD = "system="
 

@@ -103,7 +103,8 @@ class Store:
         if places and (newest := self.artifacts(places[0])):
             return newest[-1]
         token = rest.rpartition("-")[2]
-        found = [Artifact(path) for path in self.folders(where or None) if len(token) >= 4 and self._is_key(token, path)]
+        folders = [path for place in self.places(where) for path in self.folders(place)] if where else self.folders()
+        found = [Artifact(path) for path in folders if len(token) >= 4 and self._is_key(token, path)]
         if len(found) == 1:
             return found[0]
         if found:

@@ -80,7 +80,7 @@ def test_a_killed_worker_costs_its_parts_alone_and_the_bytes_are_those_of_a_loca
     def kill_one_at_work() -> None:
         until = time.monotonic() + 60
         while not victim and time.monotonic() < until:
-            for path in store.glob("numbers/*.partial/running/*.json"):
+            for path in store.glob("toy/numbers/*.partial/running/*.json"):
                 with contextlib.suppress(OSError, ValueError, StopIteration):
                     parents = {parent.pid for parent in psutil.Process(json.loads(path.read_bytes())["pid"]).parents()}
                     process = next(worker for worker in workers if worker.pid in parents)
@@ -123,7 +123,7 @@ def test_a_scheduler_that_dies_is_the_machine_s_fault_and_costs_no_finished_part
 
     def kill() -> None:
         until = time.monotonic() + 60
-        while not list((tmp_path / "store").glob("numbers/*.partial/markers/*.json")) and time.monotonic() < until:
+        while not list((tmp_path / "store").glob("toy/numbers/*.partial/markers/*.json")) and time.monotonic() < until:
             time.sleep(0.02)
         for process in psutil.Process().children():
             if "scheduler" in process.cmdline():
@@ -136,7 +136,7 @@ def test_a_scheduler_that_dies_is_the_machine_s_fault_and_costs_no_finished_part
             run(tmp_path / "store", {"name": "dask", "address": address}, numbers={"n": 24, "pause_s": 0.3})
     finally:
         killer.join()
-    done = {item for path in tmp_path.glob("store/numbers/*.partial/markers/*.json") for item in read_sealed(path)["items"]}
+    done = {item for path in tmp_path.glob("store/toy/numbers/*.partial/markers/*.json") for item in read_sealed(path)["items"]}
     assert 0 < len(done) < 24
     assert run(tmp_path / "store", numbers={"n": 24, "log_to": str(log)})[0] == run(tmp_path / "local", numbers={"n": 24})[0]
     assert not done & set(log.read_text().split())

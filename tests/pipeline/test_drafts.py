@@ -130,7 +130,7 @@ def test_force_takes_nothing_that_another_run_had_finished(run, tmp_path):
     artifacts, lines, computed = run(force="numbers")
     assert len(computed) == 12
     assert "force takes nothing of what an earlier run had finished" in notes(lines)[0]
-    assert len(list((tmp_path / "store" / ".trash").glob("numbers-*.partial-*/markers/*"))) == 3
+    assert len(list((tmp_path / "store" / ".trash").glob("toy-numbers-*.partial-*/markers/*"))) == 3
     assert Store(tmp_path / "store").drafts() == []
     assert artifacts["numbers"].verify(deep=True) == []
 

@@ -345,8 +345,8 @@ def test_what_a_run_found_made_is_in_use_from_its_start_on(run, tmp_path):
 @contextlib.contextmanager
 def held_elsewhere(claim):
     """Another process has the claim."""
-    take = f"print(Claim(Path({str(claim.path)!r})).take(), flush=True)"
-    code = f"import time; from pathlib import Path; from pipeline.store import Claim; {take}; time.sleep(600)"
+    code = "import time; from pathlib import Path; from pipeline.store import Claim; "
+    code += f"print(Claim(Path({str(claim.path)!r})).take(), flush=True); time.sleep(600)"
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout.readline() == "True\n"
@@ -423,7 +423,8 @@ def test_what_an_earlier_gc_left_half_deleted_is_no_artifact(run, tmp_path):
     store, numbers = Store(tmp_path / "store"), artifacts["numbers"]
     aside = numbers.path.with_name(f".gone-{numbers.path.name}")
     numbers.path.rename(aside)
-    (artifacts["squares"].path / ".gone-markers").mkdir()
+    half = store.root / "squares" / artifacts["squares"].path.name / ".gone-markers"  # then there were no systems' folders
+    half.mkdir(parents=True)
     aside.with_name(f".gone-{numbers.key}.partial").mkdir()
     assert store.find("numbers", numbers.key) is None and store.drafts() == []
     assert {path.name for path, _ in store.garbage(days=14)} == {

@@ -59,7 +59,7 @@ def at_work(store: Path, item: str):
     """Whether a worker has announced the item."""
 
     def seen() -> bool:
-        for path in store.glob("*/*.partial/running/*.json"):
+        for path in store.glob("toy/*/*.partial/running/*.json"):
             with contextlib.suppress(FileNotFoundError):  # the part was finished meanwhile
                 if f'"{item}"' in path.read_text():
                     return True
@@ -97,11 +97,11 @@ def test_a_short_campaign_of_kills_ends_with_the_digests_of_an_undisturbed_run(c
 def test_a_campaign_sees_what_differs(tmp_path):
     for name, n in (("calm", 6), ("other", 8)):
         assert finish(start(command(tmp_path / name, workers=0, numbers={"n": n})))[0] == 0
-    stages = ("numbers", "squares", "total")
+    stages = ("toy/numbers", "toy/squares", "toy/total")
     assert kills.differences(tmp_path / "calm", tmp_path / "calm", stages) == []
     found = kills.differences(tmp_path / "calm", tmp_path / "other", stages)
-    assert [line.partition(" ")[0] for line in found] == ["numbers:", "squares:", "total:"]
-    path = next((tmp_path / "calm").glob("squares/*/parts/*.tar"))
+    assert [line.partition(" ")[0] for line in found] == ["toy/numbers:", "toy/squares:", "toy/total:"]
+    path = next((tmp_path / "calm").glob("toy/squares/*/parts/*.tar"))
     path.write_bytes(path.read_bytes()[:-1])
     assert "bytes, not" in kills.differences(tmp_path / "calm", tmp_path / "calm", stages)[0]
 
@@ -162,14 +162,14 @@ def test_what_the_machine_rejected_is_told_and_can_be_tried_again(tmp_path, undi
         return status, output, sorted(log.read_text().split())
 
     assert run(crash=["n002"], sleep=["n003"], limits={"wall_s": 0.5})[0] == 0
-    inodes = {path.stat().st_ino for path in tmp_path.glob("numbers/*/parts/*.tar")}
+    inodes = {path.stat().st_ino for path in tmp_path.glob("toy/numbers/*/parts/*.tar")}
     status, output, computed = run()
     assert (status, computed) == (0, [])
     assert "up to date" in output and "note: the machine rejected 2 of its items (1 crash, 1 time)" in output
     assert " retry=numbers, numbers.limits.wall_s=N allows more than 0.5" in output
     status, output, computed = run("numbers", sleep=["n003"], limits={"wall_s": 0.5})  # n002 goes well now
     assert (status, set(computed)) == (0, {"n002", "n003"}) and "DIFFERENT from before" in output
-    assert len(inodes & {path.stat().st_ino for path in tmp_path.glob("numbers/v1-*/parts/*.tar")}) == 2  # of four
+    assert len(inodes & {path.stat().st_ino for path in tmp_path.glob("toy/numbers/v1-*/parts/*.tar")}) == 2  # of four
     status, output, computed = run("numbers")
     assert (status, computed) == (0, ["n003"])
     assert digests(tmp_path)["numbers"] == undisturbed(12)["numbers"]
@@ -251,7 +251,7 @@ def test_two_runners_that_both_believe_to_hold_the_claim_corrupt_nothing(tmp_pat
     words = command(tmp_path, numbers={"n": 12, "pause_s": 0.15}, squares={"finish_s": 0.3})
     first = start(words)
     wait_for(at_work(tmp_path, "n002"), first)
-    for claim in tmp_path.glob("numbers/.*.claim"):
+    for claim in tmp_path.glob("toy/numbers/.*.claim"):
         claim.unlink()
     second = start(words)
     for process in (first, second):
@@ -267,7 +267,7 @@ def test_a_runner_that_died_holds_nothing_up(tmp_path):
     wait_for(at_work(tmp_path, "n006"), process)
     process.kill()
     process.wait()
-    assert list(tmp_path.glob("numbers/.*.claim"))
+    assert list(tmp_path.glob("toy/numbers/.*.claim"))
     status, output = finish(start(command(tmp_path, numbers={"n": 12})))
     assert status == 0 and "waiting" not in output
 
@@ -317,14 +317,14 @@ def test_a_full_disk_stops_the_run_and_the_next_one_goes_on(tmp_path):
         (disk / "ballast").write_bytes(bytes(3 << 20))
         numbers = {"n": 60, "payload_kb": 32, "pause_s": 0.01}
         found["full"] = run(numbers=numbers)
-        parts = {path.name: path.stat().st_ino for path in disk.glob("store/numbers/*.partial/parts/*.tar")}
+        parts = {path.name: path.stat().st_ino for path in disk.glob("store/toy/numbers/*.partial/parts/*.tar")}
         found["parts"] = len(parts)
-        found["marked"] = len(list(disk.glob("store/numbers/*.partial/markers/[!.]*.json")))
+        found["marked"] = len(list(disk.glob("store/toy/numbers/*.partial/markers/[!.]*.json")))
         found["left over"] = [path.name for path in disk.glob("store/**/.*.tmp")]  # they would take room
         found["again"] = run(numbers=numbers)
         (disk / "ballast").unlink()
         found["room"] = run(numbers=numbers)
-        now = {path.name: path.stat().st_ino for path in disk.glob("store/numbers/v1-*/parts/*.tar")}
+        now = {path.name: path.stat().st_ino for path in disk.glob("store/toy/numbers/v1-*/parts/*.tar")}
         found["kept"] = sum(now.get(name) == inode for name, inode in parts.items())
         digests(disk / "store")
         """,

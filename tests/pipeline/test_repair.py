@@ -360,7 +360,9 @@ def test_damage_to_an_unfinished_artifact_is_made_good_by_the_next_run(run, tmp_
         store = tmp_path / f"store{seed}"
         with pytest.raises(UserError, match="n013"):
             run(store=str(store), numbers={"n": 15, "fail": ["n013"]})
-        files = sorted(path for path in store.glob("numbers/*.partial/**/*") if path.is_file() and path.parent.name != "logs")
+        files = sorted(
+            path for path in store.glob("toy/numbers/*.partial/**/*") if path.is_file() and path.parent.name != "logs"
+        )
         path = files[seed % len(files)]
         seen.add(path.parent.name)
         (flip if seed % 3 else cut)(path)

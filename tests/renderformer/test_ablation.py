@@ -43,7 +43,7 @@ def network(jobs: dict[str, Job], row: str):
 def test_every_row_is_a_file_and_every_file_a_row(jobs):
     assert list(jobs) == [row.name for row in ROWS] and len(jobs) == 12
     for table in NEEDED:
-        assert {path.stem for path in (CONF / "experiment" / table).glob("*.yaml")} == set(jobs)
+        assert {path.stem for path in (CONF / "renderformer" / "experiment" / table).glob("*.yaml")} == set(jobs)
 
 
 def test_rows_differ_in_the_model_alone(jobs):

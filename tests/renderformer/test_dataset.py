@@ -293,7 +293,7 @@ def test_two_ranks_with_two_workers_are_one_rank(many):
 
 RUN = """
 import json, sys
-from stages.dataset import BatchConfig, Batches, Loader, ShardDataset
+from stages.renderformer.dataset import BatchConfig, Batches, Loader, ShardDataset
 
 root, state, workers, kill = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
 config = BatchConfig(batch_scenes=4, mirror=True, bucket=2)

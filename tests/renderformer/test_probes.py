@@ -344,7 +344,7 @@ def test_tokens_are_decoded_on_held_out_scenes(inputs, jit, tmp_path, monkeypatc
 @pytest.mark.parametrize("name", PROBES)
 def test_every_probe_has_a_config_and_a_section_in_the_docs(name):
     config = parse(RunProbe.Config, compose([f"probe={name}"])["probe"], "probe")
-    assert config.name == name and (CONF / "probe" / f"{name}.yaml").is_file()
+    assert config.name == name and (CONF / "renderformer" / "probe" / f"{name}.yaml").is_file()
     assert config == PROBES[name].Config()  # the file says what the code would do without it
     assert f"`probe={name}`" in (ROOT / "docs" / "probes.md").read_text()
 
@@ -380,7 +380,7 @@ def test_what_a_record_holds_is_in_its_key():
 
     def keys(name: str, **values) -> tuple[str, str]:
         config = parse(RunProbe.Config, {"name": name, **values}, "probe")
-        planned = plan_stage(RunProbe(), config, {"shard": "a", "train": "b"}, str)
+        planned = plan_stage("renderformer", RunProbe(), config, {"shard": "a", "train": "b"}, str)
         return planned.key, base_key(planned)
 
     for one, other, same_items in (

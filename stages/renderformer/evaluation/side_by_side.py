@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import UserError
+from pipeline.store import store_of
 from pipeline.store.files import write_atomic
 
 if TYPE_CHECKING:
-    from pipeline.store import Artifact, Store, store_of
+    from pipeline.store import Artifact, Store
     from stages.renderformer.evaluation.runs import Probe, Run
 
 
