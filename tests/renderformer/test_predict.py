@@ -362,6 +362,14 @@ def test_what_is_beyond_a_limit_is_rendered_with_a_warning_that_names_it(rendere
     assert np.isfinite(next(frames)).all()
 
 
+def test_a_scene_without_light_has_no_lights_to_composite(renderer, cube):
+    scene = load_scene(cube)
+    dark = replace(scene, emission=scene.emission * 0, light_index=np.full_like(scene.light_index, -1))
+    for render in (renderer.render, lambda dark, **how: renderer.frames(dark, [0], **how)):
+        with pytest.raises(UserError, match=f"{dark.id} has no light.*emissive colour above 0"):
+            render(dark, composite_lights=True)
+
+
 def test_composited_lights_have_no_limit_in_number(cube):
     scene = many_lights(load_scene(cube, 640, Room("floor")), 12)
     sentences = [beyond_limits(scene, [0], (16, 16), {}, composite) for composite in (False, True)]

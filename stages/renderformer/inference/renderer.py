@@ -115,6 +115,7 @@ class Renderer:
         the training data that the scene is beyond.
         """
         from stages.renderformer.inference.limits import beyond_limits
+        from stages.renderformer.inference.scene_files import check_lit
 
         scene = self.load(scene) if isinstance(scene, (str, Path)) else scene
         count = len(scene.fov_deg)
@@ -122,6 +123,8 @@ class Renderer:
         for view in views:
             if not 0 <= view < count:
                 raise UserError(f"view {view} of {scene.id} does not exist: it has cameras 0 to {count - 1}")
+        if composite_lights:
+            check_lit(scene, scene.id)
         size = self._size(self.resolution if resolution is None else resolution)
         for sentence in beyond_limits(scene, views, size, self.trained_with, composite_lights):
             warnings.warn(f"{scene.id}: {sentence}", LimitWarning, stacklevel=2)

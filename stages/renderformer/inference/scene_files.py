@@ -36,6 +36,11 @@ def load_scene(path: Path | str, triangles: int | None = None, room: Room | None
     if suffix in MESHES:
         return room_scene(path, triangles, room)
     scene = released.load_scene(path)
-    if not scene.emission.any():
-        raise UserError(f"{path} has no light, its picture would be black: give an object an emissive colour above 0")
+    check_lit(scene, path)
     return scene
+
+
+def check_lit(scene: SceneRecord, name: Path | str) -> None:
+    """Raise UserError, with the scene's name, where nothing in it emits."""
+    if not scene.emission.any():
+        raise UserError(f"{name} has no light, its picture would be black: give an object an emissive colour above 0")

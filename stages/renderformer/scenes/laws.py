@@ -117,8 +117,8 @@ class MaterialLaw(Section):
     roughness_shift: float = 0.05
     smooth_share: float = 0.5
     crease_deg: float = 30.0
-    variation: Literal["diffuse_if_smooth", "all_per_triangle"] = "diffuse_if_smooth"  # released | paper
-    variation_share: float = 0.5  # released: of the smooth-shaded ones; paper: of all
+    variation: Literal["diffuse_if_smooth", "all_per_triangle"] = "diffuse_if_smooth"  # the released data's, the paper's
+    variation_share: float = 0.5  # diffuse_if_smooth: of the smooth-shaded ones; all_per_triangle: of all
 
 
 class LightLaw(Section):
