@@ -31,7 +31,7 @@ class RenderConfig(StageConfig):
     seed: int = 0
     resolution: int = Field(64, ge=8, le=4096)  # pixels per side; the paper: 256, then 512
     target_error: float = Field(0.002, ge=0)  # of the stored image, mean absolute log10(1 + x), estimated; 0: max_spp at once
-    max_spp: int = Field(4096, ge=1, le=65536)  # camera paths per pixel, shared by all lights, at most
+    max_spp: int = Field(16, ge=1, le=65536)  # camera paths per pixel, shared by all lights, at most; the paper: 4096
     mode: Literal["physical", "cycles"] = "physical"  # cycles: Blender Cycles' defaults, as far as they can be matched
     max_depth: int = Field(34, ge=2)  # longest path in segments: 34 is 32 bounces besides direct light
     denoise: bool = True  # Open Image Denoise, every light on its own

@@ -15,20 +15,20 @@ import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
-from pydantic import Field, model_validator
+from pydantic import Field, create_model, model_validator
 
+from model.renderformer.config import FIXED, ModelConfig
 from pipeline.config import Section, StageConfig, added, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, RunStage
 from stages.graphics.device import choose_device
-from stages.renderformer.dataset import BatchConfig, Relight
+from stages.renderformer.dataset import BatchConfig, BatchRecipe
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from model.renderformer.config import ModelConfig
     from model.renderformer.network import RenderFormer
     from model.renderformer.training import FitConfig
     from model.training.parallel import Group
@@ -38,54 +38,40 @@ if TYPE_CHECKING:
 OBJECTS = "objects.json"  # beside a checkpoint: its training objects; of a shard artifact: those of all splits
 
 
-class ModelSection(Section):
-    """The network, in the released config's field names (``model.renderformer.config.ModelConfig``, where each is
-    explained).
-    """
+class NetworkSection(Section):
+    """What `ModelSection` has besides the network's own fields."""
 
-    name: str = runtime("custom")  # for people: the variant's file name; what it holds is in the fields below
-    latent_dim: int = 768
-    num_layers: int = 12
-    num_heads: int = 6
-    dim_feedforward: int = 3072
-    num_register_tokens: int = 16
-    texture_channels: int = 13
-    texture_encode_patch_size: int = 32
-    vn_pe_num_freqs: int = 6
-    pe_type: str = "rope"
-    vertex_pe_num_freqs: int = 12
-    rope_double_max_freq: bool = False
-    view_transformer_latent_dim: int = 768
-    view_transformer_n_layers: int = 6
-    view_transformer_n_heads: int = 6
-    view_transformer_ffn_hidden_dim: int = 3072
-    view_transformer_include_self_attn: bool = True
-    view_transformer_use_swin_attn: bool = False
-    turn_to_cam_coord: bool = True
-    use_dpt_decoder: bool = True
-    dpt_features: int = 128
-    dpt_out_channels: tuple[int, ...] = (96, 192, 384, 768)
-    dpt_out_layers: tuple[int, ...] | None = None
+    name: str = runtime("custom")  # for people: the variant's file name; what it holds is in the other fields
 
     @model_validator(mode="after")
-    def _computable(self) -> ModelSection:
+    def _computable(self) -> NetworkSection:
         self.build()
         return self
 
     def build(self) -> ModelConfig:
         """As the network's own config, which refuses what it cannot compute."""
-        from model.renderformer.config import ModelConfig
-
         return ModelConfig(**self.model_dump(exclude={"name"}))
 
 
-class TrainConfig(StageConfig):
-    seed: int = 0
+# The network: the fields of ModelConfig that have more than one supported value. They are stated there.
+ModelSection = create_model(
+    "ModelSection",
+    __base__=NetworkSection,
+    __module__=__name__,
+    **{name: (kind, getattr(ModelConfig, name)) for name, kind in get_type_hints(ModelConfig).items() if name not in FIXED},
+)
+
+
+class TrainConfig(StageConfig, BatchRecipe):
     model: ModelSection = ModelSection()
+    # Of `BatchRecipe`, with other defaults: minutes are too short to learn every orientation
+    views_per_scene: int = Field(4, ge=1)
+    rotate: bool = False
+    translate_sigma: float = Field(0.0, ge=0)
+    relight: bool = True
+    max_triangles: int | None = Field(None, ge=1)  # scenes with more are left out; null: none is
     # Schedule
     steps: int = Field(1500, ge=1)
-    batch_scenes: int = Field(4, ge=1)
-    views_per_scene: int = Field(4, ge=1)
     lr: float = Field(1e-3, gt=0)
     warmup: int = Field(50, ge=0)  # steps
     decay_steps: int | None = Field(None, ge=1)  # step at which the cosine ends; null: the last step
@@ -105,16 +91,6 @@ class TrainConfig(StageConfig):
     # Initial values that say what is known (model.renderformer.initial), for runs of minutes.
     # inputs: of materials and normals, not of rays
     informed_start: bool | Literal["inputs"] = True
-    # Augmentation
-    rotate: bool = False  # turn the scene at random: the view-independent stage must not learn an orientation
-    translate_sigma: float = Field(0.0, ge=0)  # and move it; scene units
-    mirror: bool = False  # x -> -x, for half of the samples
-    relight: bool = True  # reweight the lights' own images: light transport is linear
-    lighting: Relight = Relight()  # what relight draws from
-    exposure_stops: float = added(0.0, 0.0, ge=0)  # radiance and emission times 2^U(-s, s)
-    max_triangles: int | None = Field(None, ge=1)  # scenes with more are left out; null: none is
-    shuffle_shards: int = added(0, 0, ge=0)  # scenes are shuffled over this many shards at a time; 0: over the whole split
-    bucket: int = added(0, 0, ge=0)  # scenes of this many batches are sorted by triangle count together; 0: not sorted
     # Runtime
     lpips_folder: str | None = runtime(None)  # folder with the published LPIPS weights
     micro_scenes: int | None = runtime(None, ge=1)  # scenes of a process in memory at once, gradients add up; null: all
@@ -144,8 +120,8 @@ class TrainConfig(StageConfig):
         return self
 
     def batches(self) -> BatchConfig:
-        """The loader's part: the fields of the same names."""
-        return BatchConfig(**{name: getattr(self, name) for name in BatchConfig.model_fields if hasattr(self, name)})
+        """The loader's part."""
+        return BatchConfig(**{name: getattr(self, name) for name in BatchRecipe.model_fields})
 
     def fit(self, device: str) -> FitConfig:
         """The loop's part: the fields of the same names."""

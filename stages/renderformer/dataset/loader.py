@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field, field_validator
 
-from pipeline.config import Section
+from pipeline.config import Section, added
 from pipeline.errors import UserError
 from pipeline.keys import seed_for
 from stages.renderformer.dataset.augment import (
@@ -39,21 +39,26 @@ from stages.renderformer.views import LAYERS
 MOST_DAMAGED = 64  # samples in a row that cannot be read before it is the dataset that is damaged
 
 
-class BatchConfig(Section):
-    """What a training batch holds."""
+class BatchRecipe(Section):
+    """What a training batch holds, as far as a recipe says it: a part of *train*'s config."""
 
     seed: int = 0
     batch_scenes: int = Field(4, ge=1)  # over all ranks
-    views_per_scene: int = Field(2, ge=0)  # 0: no images
-    rotate: bool = True  # rotation vector ~ N(0, I)
+    views_per_scene: int = Field(2, ge=0)  # 0: no images; a scene is encoded once for all of its views
+    rotate: bool = True  # rotation vector ~ N(0, I): the view-independent stage must not learn an orientation
     translate_sigma: float = Field(0.25, ge=0)  # scene units, translation ~ N(0, sigma^2 I)
     mirror: bool = False  # x -> -x, for half of the samples
-    exposure_stops: float = Field(0.0, ge=0)  # radiance, seen and emitted, times 2^U(-stops, stops)
-    relight: bool = False
+    relight: bool = False  # reweight the lights' own images: light transport is linear
     lighting: Relight = Relight()  # what relight draws from
+    exposure_stops: float = added(0.0, 0.0, ge=0)  # radiance, seen and emitted, times 2^U(-stops, stops)
+    shuffle_shards: int = added(0, 0, ge=0)  # scenes are shuffled over this many shards at a time; 0: over the whole split
+    bucket: int = added(0, 0, ge=0)  # global batches whose scenes are sorted by triangle count together; 0: none
+
+
+class BatchConfig(BatchRecipe):
+    """What a training batch holds: the recipe, and what only code asks for."""
+
     layers: tuple[str, ...] = ()  # AOV layers that a batch holds besides the image; only then are they read
-    shuffle_shards: int = Field(0, ge=0)  # scenes are shuffled over this many shards at a time; 0: over the whole split
-    bucket: int = Field(0, ge=0)  # global batches whose scenes are sorted by triangle count together; 0: none
     pad_multiple: int = Field(1, ge=1)  # the padded number of triangles is a multiple of it: few shapes for compilers
 
     @field_validator("layers")
@@ -133,7 +138,7 @@ class Batches:
 
     def sequence(self) -> str:
         """Hex digest of all that decides which batch follows which: not of rank, world or workers."""
-        told = json.dumps([self.config.model_dump(mode="json"), self.dataset.split, self.dataset.ids])
+        told = json.dumps([self.config.model_dump(mode="json"), self.dataset.split, self.dataset.ids], sort_keys=True)
         return hashlib.blake2b(told.encode() + self.dataset.triangles.tobytes(), digest_size=16).hexdigest()
 
     def _index(self, position: int) -> tuple[int, int]:
