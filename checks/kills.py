@@ -243,7 +243,7 @@ class Striker:
         tally = self.tally
         tally.rounds += 1
         store = self.folder / f"round-{tally.rounds}"
-        ignored = shutil.ignore_patterns(*self.campaign.stages, ".*")
+        ignored = shutil.ignore_patterns(*(Path(stage).name for stage in self.campaign.stages), ".*")
         shutil.copytree(self.calm, store, ignore=ignored)
         self.kept = {}
         before, status = tally.kills, None
