@@ -12,6 +12,7 @@ import pytest
 
 from pipeline.store import Store
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = [
     "collect.per_family=1", "remesh.resolution=48", "decimate.budgets=[64,128]",

@@ -89,6 +89,7 @@ def undisturbed(tmp_path_factory):
     return made
 
 
+@pytest.mark.slow
 def test_a_short_campaign_of_kills_ends_with_the_digests_of_an_undisturbed_run(capsys):
     assert kills.main(["--what", "synthetic", "--kills", "6", "--seed", "3"]) == 0
     assert "0 finished parts made again" in capsys.readouterr().out
