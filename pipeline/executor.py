@@ -41,6 +41,7 @@ from pipeline.worker import (
 REASONS = ("crash", "time", "memory")  # of rejects that are the machine's doing
 POLL_S = 0.25
 MAX_POOLS = 8  # that break as a whole
+MAX_OPENINGS = 1  # deaths while a worker opens: one may be bad luck
 MAX_UNEXPLAINED = 4  # deaths of a part's worker beyond what its items can explain
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -144,6 +145,7 @@ def run_on(
     flying: dict[Any, PartTask] = {}
     verdicts: dict[str, Mapping[str, Any]] = {}  # part key -> reject, for the kills that we made ourselves
     deaths: dict[str, int] = {}  # part key -> workers that died over it
+    openings = 0  # workers that died while they opened
     exhausted = False
 
     def submit(task: PartTask) -> None:
@@ -172,6 +174,15 @@ def run_on(
                 raise PoolBroken([task, *flying.values()]) from None
             except ProcessExpired as death:
                 deaths[task.part_key] = deaths.get(task.part_key, 0) + 1
+                state = _read_running(running_file(task.draft, task.part_key))
+                if state is not None and state["item"] is None:
+                    openings += 1
+                    if openings > MAX_OPENINGS:
+                        why = verdicts.get(task.part_key, {}).get("detail", f"exit code {death.exitcode}")
+                        raise MachineError(
+                            f"{task.stage}: workers die while they open what its items need ({why}), before any item: look at "
+                            "the machine's memory and at the logs; finished parts are kept"
+                        ) from None
                 if deaths[task.part_key] > 2 * len(task.items) + MAX_UNEXPLAINED:
                     raise MachineError(
                         f"{task.stage}: workers keep dying (exit code {death.exitcode}) and no item is to blame: "
@@ -189,7 +200,7 @@ def _after_death(
     path = running_file(task.draft, task.part_key)
     state = _read_running(path)
     path.unlink(missing_ok=True)
-    if state is None or state["item"] in task.killed:
+    if state is None or state["item"] is None or state["item"] in task.killed:
         # It died before or between items: nothing to blame but the machine. Starts as it was; each death is one line.
         log(f"{task.stage}: a worker died (exit code {death.exitcode}) outside any item; its part starts again")
         return task
@@ -227,6 +238,15 @@ def _hold_to_limits(task: PartTask, limits: Limits, verdicts: dict[str, Mapping[
     except psutil.Error:
         return
     wall_s = time.monotonic() - state["monotonic"]
+    if state["item"] is None:  # it opens, which no item pays for
+        if wall_s <= task.open_wall_s and memory_gb <= limits.memory_gb:
+            return
+        slow = wall_s > task.open_wall_s
+        detail = f"over {task.open_wall_s:g} s on the clock" if slow else f"over {limits.memory_gb:g} GB of memory"
+        verdicts[task.part_key] = {"detail": detail}
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(state["pid"], signal.SIGKILL)
+        return
     if cpu_s > limits.cpu_s:
         reason, limit, detail = "time", "cpu_s", f"over {limits.cpu_s:g} s of CPU time"
     elif wall_s > limits.wall_s:

@@ -103,7 +103,7 @@ def run_map(
             tasks.append(
                 PartTask(
                     run.system, planned.name, planned.key, config, inputs, environment, draft.path,
-                    part_key, group, part_items, part_item_keys, reuse, limits=limits,
+                    part_key, group, part_items, part_item_keys, reuse, limits=limits, open_wall_s=stage.open_wall_s,
                 )
             )  # fmt: skip
     part_keys = list(parts)

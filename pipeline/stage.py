@@ -101,6 +101,7 @@ class MapStage(Stage):
     """Items in, records out, in parts."""
 
     limits: ClassVar[Mapping[str, float]] = {}  # of one item, where they differ from pipeline.config.Limits
+    open_wall_s: ClassVar[float] = 1800.0  # seconds on the clock that ``open`` may take; no item's limit counts it
 
     def part_size(self, config: StageConfig, inputs: Inputs) -> int:
         """Items per part, from what the config and the inputs say: independent of the number of workers."""

@@ -82,7 +82,8 @@ def read_states(store: Store, place: str | None = None) -> list[dict[str, Any]]:
             for file in sorted((path / "running").glob("*.json")):
                 item = _read(file)
                 if "item" in item:
-                    items.append({"item": item["item"], "pid": item["pid"], "seconds": round(time.time() - item["time"], 1)})
+                    seconds = round(time.time() - item["time"], 1)
+                    items.append({"item": item["item"] or "opening", "pid": item["pid"], "seconds": seconds})
         changed = max([file.stat().st_mtime for file in (path / "markers", path / "running") if file.exists()], default=0.0)
         found.append(
             {**facts, "stage": path.parent.name, "place": where,

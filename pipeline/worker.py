@@ -1,8 +1,8 @@
 """Making one part, in whatever process the executor chose.
 
-Before each item the worker announces it in ``running/<part>.json``, so that the runner can hold the item to its limits and
-knows which one was at work when a process died. ``logs/<part>.log`` says what became of each item, how long it took and what
-libraries printed; it stays with the artifact, outside its digest.
+The worker says in ``running/<part>.json`` what it is at: before it opens what its items need, and before each item. So the
+runner can hold it to limits, and knows what was at work when a process died. ``logs/<part>.log`` says what became of each item,
+how long it took and what libraries printed; it stays with the artifact, outside its digest.
 """
 
 from __future__ import annotations
@@ -67,6 +67,7 @@ class PartTask:
     reuse: Mapping[str, Reuse] = field(default_factory=dict)
     first: str | None = None  # the item to try first, alone in a fresh process: it was at work when the last one died
     killed: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # items that died twice: their rejects
+    open_wall_s: float = 1800.0  # seconds on the clock that opening a worker may take
     limits: Limits = Limits()  # of an item; whoever runs the part holds it to them, here they tell what to try again
 
 
@@ -133,7 +134,8 @@ def _output_to(path: Path) -> Iterator[None]:
         os.close(target)
 
 
-def _announce(task: PartTask, item: str) -> None:
+def _announce(task: PartTask, item: str | None) -> None:
+    """Say what this process is at: an item, or None while it opens what its items need."""
     times = os.times()
     path = running_file(task.draft, task.part_key)
     temporary = path.with_suffix(f".{os.getpid()}")
@@ -181,11 +183,12 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
     watch = _Stopwatch()
 
     def compute(item: Item) -> list[Record] | Reject:
-        _announce(task, item.id)
-        if (task.stage, task.key) not in _opened:  # paid once per process: imports, what the stage loads
+        if (task.stage, task.key) not in _opened:  # paid once per process, by no item: imports, what the stage loads
+            _announce(task, None)
             _open(task)
             say(f"{task.stage} opened: {watch}")
             watch.start()
+        _announce(task, item.id)
         stage, worker = _open(task)
         try:
             records = list(stage.process(worker, item))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from model.renderformer import checkpoint
 from model.renderformer.config import ModelConfig
 from model.renderformer.flops import forward_flops
 from model.renderformer.network import RenderFormer
-from model.renderformer.training import BEST, LAST, FitConfig, fit, predict
+from model.renderformer.training import BEST, LAST, FitConfig, Work, fit, predict
 from model.training.logs import LOG
 from model.training.optimization import schedule
 from model.training.parallel import Group
@@ -228,3 +229,13 @@ def test_gradient_leak_revives_negative_pixels_and_changes_no_value():
         found.append((y.detach(), model.tri_token.grad.abs().sum()))
     assert (found[0][0] < 0).all() and torch.equal(found[0][0], found[1][0])
     assert found[1][1] > 50 * found[0][1]
+
+
+def test_utilisation_is_never_above_what_there_is():
+    """The peak was measured while others computed: what the run itself reached is then the most that is known."""
+    work = Work(RenderFormer(ModelConfig(**MICRO)), Group(torch.device("cpu")), "fp32")
+    shown = []
+    for ideal_s in (0.5, 1.65, 0.8):  # seconds at the measured peak, of work that took one second
+        work.began, work.ideal = time.perf_counter() - 1.0, ideal_s
+        shown.append(work.rates()["mfu"])
+    assert shown == pytest.approx([0.5, 1.0, 0.8 / 1.65], rel=0.01)

@@ -14,7 +14,7 @@ import pytest
 
 from pipeline import commands
 from pipeline.config import Section, added, parse, runtime
-from pipeline.errors import UserError
+from pipeline.errors import MachineError, UserError
 from pipeline.keys import canonical, canonical_json, seed_for
 from pipeline.run import run_pipeline
 from pipeline.stage import Record
@@ -470,3 +470,20 @@ def test_import_rules():
                     found = [node.module]
                 bad = {name.split(".")[0] for name in found} & names
                 assert not bad, f"{path.relative_to(ROOT)}:{node.lineno} imports {bad}"
+
+
+# -- opening a worker
+
+
+def test_opening_counts_against_no_item(run):
+    """An open of 2 s under a limit of 1 s: before, every process's first item was rejected as `time`."""
+    numbers = {"n": 5, "open_s": 2.0, "limits": {"wall_s": 1.0}}
+    made, lines = run(workers=1, stage="numbers", numbers=numbers)
+    assert len(made["numbers"].rows()) == 5 and made["numbers"].rejects() == []
+    assert not any("once more" in line for line in lines)
+
+
+def test_opening_has_a_limit_of_its_own_and_fails_the_stage(run, monkeypatch):
+    monkeypatch.setattr(Numbers, "open_wall_s", 0.5)
+    with pytest.raises(MachineError, match="workers die while they open what its items need .over 0.5 s on the clock"):
+        run(workers=1, stage="numbers", numbers={"n": 5, "open_s": 30.0})

@@ -27,6 +27,7 @@ class NumbersConfig(StageConfig):
     greedy: tuple[str, ...] = runtime(())
     fail: tuple[str, ...] = runtime(())
     log_to: str | None = runtime(None)  # a file that gets a line per computed item
+    open_s: float = runtime(0.0)  # seconds that opening a worker takes
 
 
 class Numbers(MapStage):
@@ -42,6 +43,7 @@ class Numbers(MapStage):
         return [Item(f"n{index:03}", group="even" if index % 2 == 0 else "odd", needs=()) for index in range(config.n)]
 
     def open(self, config, inputs, environment):
+        time.sleep(config.open_s)
         return config
 
     def process(self, config, item):
