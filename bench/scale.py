@@ -105,8 +105,8 @@ def fill(folder: Path, items: int, name: str, left: int) -> None:
     store = Store(folder)
     plan = make_plan(run, system, sections, lambda path: "")
     planned = plan[name]
-    inputs = {parent: store.find(parent, plan[parent].key) for parent in planned.stage.inputs}
-    draft = store.draft(name, planned.key, planned.preimage, print, {"system": run.system, "config": {}})
+    inputs = planned.inputs({other: store.find(plan[other].place, plan[other].key) for other in plan})
+    draft = store.draft(planned.place, planned.key, planned.preimage, print, {"system": run.system, "config": {}})
     draft.set_environment({})
     stage = load_system("bench.scale").stage(name)
     listed = sorted(stage.items(planned.config, inputs), key=lambda item: (item.group, item.id))

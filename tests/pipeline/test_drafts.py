@@ -63,7 +63,7 @@ def test_a_draft_that_other_code_began_is_continued_and_the_manifest_names_both(
     artifacts, lines, computed = run()
     assert len(computed) == 2
     (note,) = notes(lines)
-    assert "what is finished of numbers was made by other code of the same version; it is kept" in note
+    assert "what is finished of toy/numbers was made by other code of the same version; it is kept" in note
     made = artifacts["numbers"].manifest["code"]
     assert (made["digest"], made["others"]) == ("b" * 64, ["a" * 64])
     assert any("the code of numbers has changed" in line for line in notes(run()[1]))

@@ -61,7 +61,7 @@ def test_prepare_runs_once_however_many_workers_there_are(tmp_path, workers):
 
     with pytest.raises(Exception, match="8 item"):
         run(fail=True)
-    (draft,) = (tmp_path / "store" / "shared").glob("*.partial")
+    (draft,) = (tmp_path / "store").glob("*/shared/*.partial")
     prepared = draft / "state" / ".prepared" / "shared.txt"
     prepared.write_bytes(b"damaged since")
     artifact = run()

@@ -295,7 +295,7 @@ def test_what_cannot_be_repaired_says_what_to_do(run, tmp_path):
     artifacts, _ = run()
     store, squares = Store(tmp_path / "store"), artifacts["squares"]
     lines = mend(tmp_path, squares)
-    assert lines == [f"squares/{squares.path.name}: sound, nothing to repair"]
+    assert lines == [f"{squares.name}: sound, nothing to repair"]
     for name in ("manifest.json", "draft.json"):
         flip(squares.path / name)
     with pytest.raises(Damaged, match="delete the folder and run"):

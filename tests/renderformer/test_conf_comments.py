@@ -14,7 +14,7 @@ from pipeline.stage import load_system
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SETTING = re.compile(r"(?P<indent> *)(?P<key>\w+):(?P<value>[^#]*)(?:#(?P<comment>.*))?$")
-SYSTEMS = [load_system(name) for name in ("renderformer", "imported")]
+SYSTEMS = [load_system(name) for name in ("renderformer",)]
 
 
 def alternatives(comment: str) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from omegaconf import OmegaConf
 
 from pipeline.config import parse
 from pipeline.errors import Reject, UserError
+from pipeline.hydra_config import compose
 from pipeline.keys import canonical_json
 from pipeline.stage import Item
 from stages.renderformer.records import SceneRecord
@@ -21,12 +21,11 @@ from stages.renderformer.scenes.assemble import choose_rungs, place
 from stages.renderformer.scenes.laws import TEMPLATES, WALLS, LightLaw, Material, Placement, draw_plan
 from tests.renderformer.fakes import decimated
 
-ROOT = Path(__file__).resolve().parents[2]
 N = 2000
 
 
 def config_of(name: str, **overrides) -> SceneConfig:
-    data = OmegaConf.merge(OmegaConf.load(ROOT / f"conf/renderformer/scene/{name}.yaml"), {"seed": 0}, overrides)
+    data = OmegaConf.merge(OmegaConf.create(compose([f"scene={name}", "seed=0"])["scene"]), overrides)
     return parse(SceneConfig, OmegaConf.to_container(data), "scene")
 
 
