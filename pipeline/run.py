@@ -14,12 +14,15 @@ from pipeline.cluster import Cluster, DaskExecutor
 from pipeline.code import code_digest
 from pipeline.errors import (
     Damaged,
+    MachineError,
     UserError,
 )
 from pipeline.make import describe, machine_rejects, make_artifact
 from pipeline.plan import Planned, RunConfig, hashes_of, label, make_plan, split_config
 from pipeline.stage import RunStage
 from pipeline.store import Artifact, Store
+
+LEADER_PATIENCE_S = 600.0  # a follower waits so long without a sign of the process that leads
 
 
 def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[[str], None] = print) -> dict[str, Any]:
@@ -86,8 +89,20 @@ def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[
 def _follow(plan: Mapping[str, Planned], todo: set[str], store: Store) -> dict[str, Any]:
     """What a process does that another one leads: its part of run stages, once what they read has been made."""
 
+    def leader_works() -> bool:
+        """Whether some process holds the claim of a stage of this plan, at which the leader is then at work."""
+        return any(store.claim(plan[name].place, plan[name].key).holder() is not None for name in todo)
+
     def wait_for(name: str) -> Artifact:
+        last_sign = time.monotonic()
         while (artifact := store.find(plan[name].place, plan[name].key)) is None:
+            if leader_works():
+                last_sign = time.monotonic()
+            elif time.monotonic() - last_sign > LEADER_PATIENCE_S:
+                raise MachineError(
+                    f"waiting for {name}: nobody has worked on it or on what it needs for {LEADER_PATIENCE_S:g} s, so the "
+                    "process that leads this torchrun is gone: start all of it again, finished parts are kept"
+                )
             time.sleep(0.5)
         return artifact
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tarfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ from pipeline.run import run_pipeline
 from pipeline.stage import Record
 from pipeline.store import Store
 from pipeline.sweep import plan_of
-from tests.pipeline.toy import Numbers, Squares
+from tests.pipeline.toy import Numbers, Squares, Total
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -487,3 +488,43 @@ def test_opening_has_a_limit_of_its_own_and_fails_the_stage(run, monkeypatch):
     monkeypatch.setattr(Numbers, "open_wall_s", 0.5)
     with pytest.raises(MachineError, match="workers die while they open what its items need .over 0.5 s on the clock"):
         run(workers=1, stage="numbers", numbers={"n": 5, "open_s": 30.0})
+
+
+# -- followers of a torchrun
+
+
+@pytest.fixture
+def follower(tmp_path, monkeypatch):
+    """A run as its second process sees it: it makes nothing itself."""
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setattr("pipeline.run.LEADER_PATIENCE_S", 1.0)
+    sections = {"numbers": {"n": 4}, "squares": {}, "total": {}}
+    root = {"system": "tests.pipeline.toy", "stage": "total", "store": str(tmp_path / "store"), "workers": 0} | sections
+    return root, plan_of(root)
+
+
+def test_a_follower_does_not_wait_for_a_leader_that_is_gone(follower):
+    with pytest.raises(MachineError, match="the process that leads this torchrun is gone"):
+        run_pipeline(follower[0], ["test"], print)
+
+
+def test_a_follower_waits_for_what_the_stage_reads_while_the_leader_works(follower, tmp_path, monkeypatch):
+    """total reads squares alone: *numbers* may be gone. The leader holds a claim for longer than the patience, then is done."""
+    root, plan = follower
+    followed = []
+    monkeypatch.setattr(Total, "follow", lambda stage, config, inputs: followed.append(sorted(inputs)))
+    claim = Store(tmp_path / "store").claim(plan["numbers"].place, plan["numbers"].key)
+    with held_elsewhere(claim), ThreadPoolExecutor(1) as thread:
+        waiting = thread.submit(run_pipeline, root, ["test"], print)
+        time.sleep(2.5)
+        assert not waiting.done()
+        for name in ("RANK", "WORLD_SIZE"):
+            monkeypatch.delenv(name)
+        leader = {**root, "store": str(tmp_path / "other"), "stage": "squares"}
+        made = run_pipeline(leader, ["test"], print)["artifacts"]["squares"]
+        target = Store(tmp_path / "store").root / made.place / made.path.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        made.path.rename(target)
+        waiting.result(timeout=30)
+    assert followed == [["squares"]]
