@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_type_hints
@@ -101,6 +101,7 @@ class TrainConfig(StageConfig, BatchRecipe):
     threads: int | None = runtime(None, ge=1)  # CPU threads; null: torch's choice
     ahead: int = runtime(4, ge=1)  # batches that are read ahead
     loader_workers: int = runtime(0, ge=0)  # processes that decode them; 0: threads of this one
+    skip_damaged_shards: bool = runtime(False)  # go on without the samples of shards that are missing or cut
     log_every: int = runtime(50, ge=1)  # steps
     validate_every: int = runtime(200, ge=1)
     validation_scenes: int = runtime(16, ge=1)
@@ -195,10 +196,11 @@ class Train(RunStage):
         # a well-trained network's attention is full of numbers below 1e-38, which a CPU computes many times slower than zeros;
         # before the first parallel operation, as threads take the setting of the one that starts them
         torch.set_flush_denormal(True)
-        train = ShardDataset(inputs["shard"], "train", config.max_triangles)
+        skip = config.skip_damaged_shards
+        train = ShardDataset(inputs["shard"], "train", config.max_triangles, skip_damaged_shards=skip)
         validation = train
         if config.validate_on != "train":
-            validation = ShardDataset(inputs["shard"], config.validate_on, config.max_triangles)
+            validation = ShardDataset(inputs["shard"], config.validate_on, config.max_triangles, skip_damaged_shards=skip)
         batches = Batches(train, config.batches(), group.rank, group.world)
         held_out = list(itertools.islice(evaluation_samples(validation), config.validation_scenes))
 
@@ -219,10 +221,11 @@ class Train(RunStage):
                 f"images of {train.resolution} px cannot train {config.model.name}: its resolution must be a "
                 f"multiple of {multiple} (render.resolution)"
             )
-        return fit(
+        damaged: dict[str, str] = {}
+        summary = fit(
             model,
             config.fit(group.device.type),
-            lambda start, stop: prefetch(batches, start, stop, config.ahead, config.loader_workers),
+            lambda start, stop: name_damaged(prefetch(batches, start, stop, config.ahead, config.loader_workers), damaged, say),
             held_out,
             state,
             group,
@@ -231,6 +234,19 @@ class Train(RunStage):
             tensorboard=files / "tensorboard" if files is not None and config.tensorboard else None,
             trained_with={"triangles": str(train.triangles.max()), "resolution": str(train.resolution)},
         )
+        return summary | ({"damaged_samples": len(damaged)} if damaged else {})
+
+
+def name_damaged(
+    batches: Iterable[dict[str, Any]], damaged: dict[str, str], say: Callable[[str], None]
+) -> Iterator[dict[str, Any]]:
+    """The batches as they come. Each sample that they skipped is said once, and kept in ``damaged``: id -> reason."""
+    for batch in batches:
+        for id, reason in batch["damaged"]:
+            if id not in damaged:
+                damaged[id] = reason
+                say(f"sample {id} is damaged, another one takes its place: {reason}")
+        yield batch
 
 
 def initial_folder(reference: str) -> Path:

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from copy import copy
 
 import numpy as np
 import pytest
@@ -283,3 +284,42 @@ def test_predict_refuses(trained, shared_data, tmp_path, arguments, message):
     arguments = {"out": "x.exr", "resolution": 16} | arguments
     with pytest.raises(UserError, match=message):
         predict(scene, trained[0].files / "checkpoint", tmp_path / arguments.pop("out"), **arguments)
+
+
+@pytest.fixture
+def damaged(shard, tmp_path):
+    """A copy of the shards with one training sample whose scene does not match its checksum, and that sample's row."""
+    shutil.copytree(shard.path, tmp_path / "copy")
+    rows = map(json.loads, (tmp_path / "copy" / "files" / "index.jsonl").read_text().splitlines())
+    row = next(row for row in rows if row["split"] == "train")
+    offset, size, _ = row["members"]["scene.npz"]
+    with open(tmp_path / "copy" / row["shard"], "r+b") as file:
+        file.seek(offset + size // 2)
+        byte = file.read(1)[0]
+        file.seek(-1, 1)
+        file.write(bytes([byte ^ 4]))
+    return moved(shard, tmp_path), row
+
+
+def moved(shard, folder):
+    """The artifact as it lies in the folder ``copy``."""
+    other = copy(shard)
+    other.path = folder / "copy"
+    return other
+
+
+def test_a_damaged_sample_is_said_once_by_name_and_counted(damaged, tmp_path):
+    artifact, row = damaged
+    draft, said = train_on(artifact, tmp_path / "run", steps=6)
+    assert [line.split(":")[0] for line in said if "damaged" in line] == [
+        f"sample {row['id']} is damaged, another one takes its place"
+    ]
+    assert draft.notes["training"]["damaged_samples"] == 1
+
+
+def test_a_damaged_shard_stops_training_with_a_setting_that_exists(damaged, tmp_path):
+    artifact, row = damaged
+    path = artifact.path / row["shard"]
+    path.write_bytes(path.read_bytes()[:-1024])
+    with pytest.raises(UserError, match=r"the shard .* bytes, not .*train\.skip_damaged_shards=true"):
+        train_on(artifact, tmp_path / "run", steps=2)

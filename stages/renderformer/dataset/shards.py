@@ -324,7 +324,7 @@ class ShardDataset:
             what = "is missing" if there is None else f"has {there:,} bytes, not {size:,}"
             raise DamagedShard(
                 f"the shard {path} {what}: fetch it again or make it again (lightmill verify), "
-                "or set skip_damaged_shards to go on without its samples"
+                "or set skip_damaged_shards (train.skip_damaged_shards=true) to go on without its samples"
             )
 
 
