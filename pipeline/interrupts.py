@@ -46,6 +46,8 @@ def guarded(work: Callable[[], None], debug: bool = False) -> int:
         print(f"error: {error}", file=sys.stderr, flush=True)
         return status_of(error)
     except KeyboardInterrupt:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # all has stopped: one more would only change the exit status
         print("interrupted: what is finished is kept, the same command continues", file=sys.stderr)
         return INTERRUPTED
     return 0
