@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 
 from pipeline.interrupts import guarded
 from pipeline.run import run_pipeline
-from pipeline.sweep import check_keys, restore_interrupts
+from pipeline.sweep import check_keys
 from pipeline.worker import die_with_parent
 
 
 def main() -> int:
     """Returns the exit status of the run."""
     die_with_parent()  # it ends with the sweep that started it ...
-    restore_interrupts()  # ... but Ctrl-C shall reach it
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ... but Ctrl-C shall reach it
     job = json.load(sys.stdin)
 
     def work() -> None:
-        check_keys(job["name"], job["root"] | {"workers": "auto"}, job["keys"])
+        check_keys(job["name"], job["root"], job["keys"])
         run_pipeline(job["root"], job["command"], lambda text: print(text, flush=True))
 
     return guarded(work, debug=job["root"]["debug"])

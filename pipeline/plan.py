@@ -71,10 +71,14 @@ class Planned:
         """The folder of the store where such artifacts lie (``pipeline.store.place``)."""
         return place(self.preimage)
 
+    @property
+    def parents(self) -> dict[str, str]:
+        """Role -> the stage that plays it, of what this config reads."""
+        return self.stage.parents(self.config)
+
     def inputs(self, artifacts: Mapping[str, Any]) -> dict[str, Any]:
         """Role -> what ``artifacts`` holds for the stage that plays it."""
-        roles = self.stage.roles()
-        return {role: artifacts[roles[role]] for role in self.stage.reads(self.config)}
+        return {role: artifacts[parent] for role, parent in self.parents.items()}
 
 
 def make_plan(
@@ -92,11 +96,10 @@ def make_plan(
         if name not in sections:
             raise UserError(f"the config has no section {name!r} for the stage of that name")
         config = parse(stage.Config, sections[name], name)
-        roles = stage.roles()
-        inputs = {role: roles[role] for role in stage.reads(config)}
-        for parent in inputs.values():
+        parents = stage.parents(config)
+        for parent in parents.values():
             visit(parent, (*path, name))
-        keys = {role: plan[parent].key for role, parent in inputs.items()}
+        keys = {role: plan[parent].key for role, parent in parents.items()}
         plan[name] = plan_stage(system.name, stage, config, keys, hash_file)
 
     for name in run.stage:

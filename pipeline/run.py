@@ -106,10 +106,9 @@ def _follow(plan: Mapping[str, Planned], todo: set[str], store: Store) -> dict[s
             time.sleep(0.5)
         return artifact
 
-    stages = {name: name for name in plan}
     for name, planned in plan.items():
         if name in todo and isinstance(planned.stage, RunStage):
-            inputs = {role: wait_for(parent) for role, parent in planned.inputs(stages).items()}
+            inputs = {role: wait_for(parent) for role, parent in planned.parents.items()}
             planned.stage.follow(planned.config, inputs)
     return {"artifacts": {}, "keys": {name: planned.key for name, planned in plan.items()}}
 
@@ -124,7 +123,7 @@ def _todo(run: RunConfig, plan: Mapping[str, Planned], artifacts: Mapping[str, A
         if name in todo or (artifacts[name] is not None and name not in again):
             return
         todo.add(name)
-        for parent in plan[name].inputs({other: other for other in plan}).values():
+        for parent in plan[name].parents.values():
             need(parent)
 
     for name in (*again, *run.stage):

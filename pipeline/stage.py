@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pipeline.config import StageConfig
 from pipeline.errors import Reject, UserError
+from pipeline.store.record import Record
 
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Draft
-from pipeline.store.record import Record
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +61,11 @@ class Stage:
         The others enter neither the key nor the run.
         """
         return tuple(self.roles())
+
+    def parents(self, config: StageConfig) -> dict[str, str]:
+        """Role -> the stage that plays it, of what this config reads."""
+        roles = self.roles()
+        return {role: roles[role] for role in self.reads(config)}
 
     def agree(self, config: StageConfig, configs: Mapping[str, StageConfig]) -> None:
         """Raise UserError where this config does not go with those of the stages before it, by stage name in ``configs``.

@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import os
 import queue
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -212,8 +211,7 @@ def _make_shared(job: Job, shared: Mapping[str, str], command: Sequence[str], ou
             raise UserError(
                 f"{setting}={','.join(ours)}: all jobs of the sweep share it; do that by itself, then run the sweep"
             )
-    names = {name: name for name in job.plan}
-    read = {parent for name in shared for parent in job.plan[name].inputs(names).values()}
+    read = {parent for name in shared for parent in job.plan[name].parents.values()}
     run_pipeline({**job.root, "stage": [name for name in shared if name not in read], "force": [], "retry": []}, command, out)
 
 
@@ -233,7 +231,6 @@ def run_by_launcher(
     from hydra._internal.callbacks import Callbacks
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.plugins import Plugins
-    from hydra.core.singleton import Singleton  # noqa: F401 - a launcher pickles it
     from hydra.types import HydraContext, RunMode
 
     planned = {job.name: job.keys for job in jobs}
@@ -275,8 +272,3 @@ def run_by_launcher(
             print(f"error: {label(job, jobs)}: {error}", file=sys.stderr, flush=True)
             statuses[label(job, jobs)] = status_of(error)
     return statuses
-
-
-def restore_interrupts() -> None:
-    """In the process of a job: Ctrl-C reaches it, whatever its parent made of it."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)

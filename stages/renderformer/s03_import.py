@@ -1,9 +1,8 @@
 """scene, imported: scenes in the released formats as a source for everything that follows.
 
 Reads a folder of ``.json``, ``.h5`` and ``.hdf5`` scenes; writes one ``SceneRecord`` each, as
-``stages.renderformer.s03_scene`` does, so that render, shard, train and evaluate work unchanged. One design choice: it is the
-*scene* stage of another system (``stages.imported``), in which nothing comes before it; ``scene=imported scene.path=DIR``
-chooses both.
+``stages.renderformer.s03_scene`` does, so that render, shard, train and evaluate work unchanged. One design choice: it is a
+variant of the *scene* stage (``stages.renderformer.s03_variants``), in which nothing comes before it.
 
 Scenes below ``train/``, ``validation/`` or ``test/`` belong to that split (as ``lightmill export`` writes them), all others
 to ``scene.split``.
