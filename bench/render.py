@@ -53,6 +53,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.atomic import atomic_path
 from pipeline.keys import seed_for
 from pipeline.store import Artifact
 from stages.graphics import denoising
@@ -251,9 +252,8 @@ class Bench:
         path = self.arguments.work / "truth" / f"{digest.hexdigest()[:24]}.npz"
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = path.with_suffix(".tmp.npz")
-            np.savez(temporary, **make())
-            temporary.replace(path)
+            with atomic_path(path) as temporary:
+                np.savez(temporary, **make())
         with np.load(path) as file:
             return dict(file)
 

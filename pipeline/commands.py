@@ -75,7 +75,7 @@ def command_ls(store: Store, arguments: argparse.Namespace) -> int:
         if None in places or where in places:
             holder = store.claim(where, path.name.removesuffix(".partial")).holder()
             state = f"in the making by process {holder['pid']} on {holder['host']}" if holder else "unfinished"
-            parts = len(list((path / "markers").glob("*.json")))
+            parts = len(list((path / "markers").glob("[!.]*.json")))
             print(f"{where}/{path.name[:12]}.partial  {parts} parts, {state}")
     readable = {artifact.path for artifact in artifacts}
     for path in (path for where in places for path in store.folders(where)):

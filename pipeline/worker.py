@@ -24,6 +24,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from pipeline.atomic import atomic_path
 from pipeline.config import Limits
 from pipeline.errors import STORAGE_ERRORS, Damaged, Reject, UserError
 from pipeline.stage import Item, MapStage, Record, load_system
@@ -137,12 +138,10 @@ def _output_to(path: Path) -> Iterator[None]:
 def _announce(task: PartTask, item: str | None) -> None:
     """Say what this process is at: an item, or None while it opens what its items need."""
     times = os.times()
-    path = running_file(task.draft, task.part_key)
-    temporary = path.with_suffix(f".{os.getpid()}")
     # ``time`` is for people; limits go by ``monotonic``, which no change of the clock moves
     state = {"pid": os.getpid(), "item": item, "cpu_s": times.user + times.system}
-    temporary.write_text(json.dumps({**state, "time": time.time(), "monotonic": time.monotonic()}))
-    os.replace(temporary, path)
+    with atomic_path(running_file(task.draft, task.part_key), durable=False) as temporary:
+        temporary.write_text(json.dumps({**state, "time": time.time(), "monotonic": time.monotonic()}))
 
 
 def run_part(task: PartTask, log: bool = True) -> PartResult:

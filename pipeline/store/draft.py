@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from pipeline.atomic import TEMPORARY, publish, sync, write_atomic
 from pipeline.errors import UserError
 from pipeline.keys import digest_of
 from pipeline.store.artifact import DRAFT, Records, is_sound, read_draft
@@ -22,8 +23,6 @@ from pipeline.store.files import (
     hash_file,
     json_line,
     read_sealed,
-    sync,
-    write_atomic,
     write_jsonl,
     write_sealed,
 )
@@ -67,7 +66,8 @@ class Draft(Records):
 
     def sweep(self) -> None:
         """Delete what workers that were killed left half written. Only for who holds the claim."""
-        for pattern in ("parts/.*.tmp", "markers/.*.tmp", ".*.tmp", "running/*.json"):
+        folders = ("", "parts/", "markers/", "files/**/", "state/**/")
+        for pattern in ("running/*.json", *(folder + TEMPORARY for folder in folders)):
             for path in self.path.glob(pattern):
                 path.unlink(missing_ok=True)
 
@@ -151,8 +151,7 @@ class Draft(Records):
                     os.link(source, temporary)
                 except OSError:
                     shutil.copyfile(source, temporary)
-                    sync(temporary)
-                os.replace(temporary, target)
+                publish(temporary, target)
         self.finish_part(part_key, marker)
         return True
 
@@ -248,11 +247,8 @@ class PartWriter:
         if not self._rows:
             self.discard()
             return {"digest": None, "bytes": 0, "rows": []}
-        self._file.flush()
-        os.fsync(self._file.fileno())
         self._file.close()
-        os.replace(self._path, self._draft.part_path(digest))
-        sync(self._path.parent)
+        publish(self._path, self._draft.part_path(digest))
         for row in self._rows:
             row["part"] = digest
         return {"digest": digest, "bytes": self._tar.size, "rows": self._rows}

@@ -11,13 +11,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pipeline.atomic import sync, write_atomic
 from pipeline.errors import Damaged, MachineError, UserError
 from pipeline.store.artifact import DRAFT, Artifact, read_draft
 from pipeline.store.claim import Claim
 from pipeline.store.draft import UNKNOWN, WORKING, Draft
 from pipeline.store.files import (
-    sync,
-    write_atomic,
     write_sealed,
 )
 

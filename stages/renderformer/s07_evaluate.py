@@ -92,7 +92,7 @@ class Evaluate(MapStage):
 
     def prepare(self, config: EvaluateConfig, inputs: Inputs, folder: Path) -> None:
         """The mean training images: up to 1,024 views are read for them, and held as half floats."""
-        from pipeline.store.files import write_atomic
+        from pipeline.atomic import write_atomic
         from stages.graphics.arrays import pack_arrays
 
         write_atomic(folder / MEAN_IMAGES, pack_arrays(mean_training_images(config, inputs)))

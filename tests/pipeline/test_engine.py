@@ -453,7 +453,10 @@ def test_difference_names_the_parameter(run):
 
 
 def test_import_rules():
-    """The engine knows no mesh, image or tensor; only stages/ imports mesh, renderer and shard libraries."""
+    """The engine knows no mesh, image or tensor; only stages/ imports mesh, renderer and shard libraries.
+
+    ``pipeline.atomic`` is anybody's: it writes files and knows nothing of the engine.
+    """
     import ast
 
     forbidden = {
@@ -469,7 +472,7 @@ def test_import_rules():
                     found = [alias.name for alias in node.names]
                 elif isinstance(node, ast.ImportFrom) and not node.level:
                     found = [node.module]
-                bad = {name.split(".")[0] for name in found} & names
+                bad = {name.split(".")[0] for name in found if name != "pipeline.atomic"} & names
                 assert not bad, f"{path.relative_to(ROOT)}:{node.lineno} imports {bad}"
 
 

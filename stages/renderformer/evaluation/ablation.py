@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.atomic import write_atomic
 from pipeline.errors import UserError
 from pipeline.hydra_config import CONF
-from pipeline.store.files import write_atomic
 
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Store

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.atomic import write_atomic
 from pipeline.errors import UserError
 from pipeline.store import store_of
-from pipeline.store.files import write_atomic
 
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Store
