@@ -201,9 +201,6 @@ class Store:
         except OSError:
             pass  # a read-only store can still be read
 
-    def last_used(self, artifact: Artifact) -> float:
-        return self._used(artifact.key, artifact.manifest["finished"])
-
     def _used(self, key: str, made: float) -> float:
         path = self.root / ".used" / key
         return path.stat().st_mtime if path.exists() else made

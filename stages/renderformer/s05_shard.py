@@ -22,8 +22,6 @@ from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.renderformer.views import VIEW, view_members
 
-CARD = "README.md"
-
 
 class ShardConfig(StageConfig):
     shard_mb: float = Field(256.0, gt=0)  # size that shards come near: a power of two of scenes each
