@@ -19,6 +19,9 @@ from pipeline.progress import duration
 from pipeline.repair import repair
 from pipeline.status import lines, read_states
 from pipeline.store import Artifact, Store, iter_inputs
+from pipeline.terminal import console, print_table
+
+STATE_STYLES = {"running": "green", "stopped": "yellow", "dead": "red"}
 
 
 def size(count: float) -> str:
@@ -63,13 +66,7 @@ def _places(store: Store, reference: str | None) -> list[str | None]:
 def command_ls(store: Store, arguments: argparse.Namespace) -> int:
     places = _places(store, arguments.stage)
     artifacts = [artifact for where in places for artifact in store.artifacts(where)]
-    for artifact in artifacts:
-        outputs = artifact.manifest["outputs"]
-        age = duration(time.time() - artifact.manifest["finished"])
-        pin = "pinned" if store.pinned(artifact.key) else ""
-        rejects = sum(outputs["rejects"].values())
-        name = artifact.name
-        print(f"{name:<44} {outputs['records']:>7} records {rejects:>5} rejected {size(outputs['bytes']):>8}  {age} ago  {pin}")
+    print_table((_list_row(store, artifact) for artifact in artifacts), right=(1, 2, 3))
     for path in store.drafts():
         where = store.place_of(path)
         if None in places or where in places:
@@ -85,6 +82,14 @@ def command_ls(store: Store, arguments: argparse.Namespace) -> int:
     if not artifacts:
         print(f"no artifacts in {store.root}")
     return 0
+
+
+def _list_row(store: Store, artifact: Artifact) -> tuple[str, ...]:
+    outputs = artifact.manifest["outputs"]
+    age = duration(time.time() - artifact.manifest["finished"])
+    rejects = sum(outputs["rejects"].values())
+    pin = "pinned" if store.pinned(artifact.key) else ""
+    return artifact.name, f"{outputs['records']} records", f"{rejects} rejected", size(outputs["bytes"]), f"{age} ago", pin
 
 
 def command_show(store: Store, arguments: argparse.Namespace) -> int:
@@ -221,8 +226,11 @@ def command_status(store: Store, arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(states, indent=1))
         return 0
+    out = console()
     for state in states:
-        print("\n".join(lines(state)))
+        head, *rest = lines(state)
+        out.print(head, style=STATE_STYLES[state["state"]])
+        out.print("\n".join(rest))
     if not states:
         print(f"nothing is running or unfinished in {store.root}")
     return 0

@@ -56,6 +56,7 @@ pipeline.code  pipeline.hydra_config  pipeline.worker
 pipeline.stage  pipeline.status
 pipeline.store
 pipeline.config  pipeline.interrupts  pipeline.keys  pipeline.progress
+pipeline.terminal
 pipeline.errors  pipeline.atomic
 pipeline
 """
