@@ -196,14 +196,14 @@ def test_limits_reject_the_item_alone(run, kind, limits, reason):
     assert [(r["item"], r["reason"]) for r in artifacts["numbers"].rejects()] == [("n003", reason)]
 
 
-def test_a_bug_in_one_item_fails_its_part_and_keeps_the_others(run, tmp_path):
+def test_a_bug_in_one_item_leaves_its_part_unfinished_and_keeps_all_other_items(run, tmp_path):
     with pytest.raises(UserError, match="n003") as caught:
         run(numbers={"fail": ["n003"]})
     assert "RuntimeError: a bug" in str(caught.value)
     (draft,) = Store(tmp_path / "store").drafts()
     assert len(list((draft / "markers").iterdir())) == 3  # of 4 parts
     _, lines = run()
-    assert "6 of them already there" in " ".join(lines)
+    assert "9 of them already there" in " ".join(lines)
 
 
 # -- the store
