@@ -41,7 +41,7 @@ stages.graphics.arrays  stages.graphics.tonemap
 stages.graphics
 model.renderformer
 model.training
-model.lpips  model.files
+model.lpips  model.files  model.timing
 model.errors
 model
 pipeline.__main__  pipeline.job  pipeline.commands
