@@ -37,7 +37,7 @@ stages.renderformer.records
 stages
 stages.graphics.geometry  stages.graphics.statistics  stages.graphics.video  stages.graphics.device  stages.graphics.denoising
 stages.graphics.metrics  stages.graphics.exr
-stages.graphics.arrays  stages.graphics.tonemap
+stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.page
 stages.graphics
 model.renderformer
 model.training
