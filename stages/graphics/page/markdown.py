@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from stages.graphics.page.parts import Block, Section
+from stages.graphics.page.parts import Block, Cell, Section
 
 
 def table(columns: Sequence[Any], rows: Iterable[Sequence[Any]], numeric: bool = False) -> list[str]:
@@ -20,7 +20,8 @@ def line(cells: Sequence[Any]) -> str:
 
 def cell(value: Any) -> str:
     """A cell on one line, with nothing in it that would end the cell or begin a tag."""
-    return "–" if value is None else " ".join(str(value).split()).replace("|", "\\|").replace("<", "\\<")
+    text = value.text if isinstance(value, Cell) else value
+    return "–" if text is None else " ".join(str(text).split()).replace("|", "\\|").replace("<", "\\<")
 
 
 def document(title: str, lead: Iterable[Block], sections: Iterable[Section]) -> str:

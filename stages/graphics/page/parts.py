@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 class Cell:
     """A table's cell that is more than its text.
 
-    note: smaller, below the text. kind: CSS classes (``best``, ``good``, ``bad``, ``soft``, ``strong``). colour: of a dot
+    note: smaller, below the text. kind: CSS classes (``best``, ``good``, ``bad``, ``soft``,
+    ``strong``, ``code``). colour: of a dot
     before the text, or, with ``share`` (0 to 1), of a bar behind it.
     """
 

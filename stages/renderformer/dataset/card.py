@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.graphics.page import Code, Picture, Section, Table, Text, embed, render
+from stages.graphics.page import Cell, Code, Picture, Section, Table, Text, embed, render
 from stages.graphics.page.parts import Block
 from stages.renderformer.dataset.distributions import (
     Quantities,
@@ -246,7 +246,8 @@ def sections(dataset: Dataset, distributions: Sequence[Block]) -> list[Section]:
 
 
 def field_blocks(dataset: Dataset) -> list[Block]:
-    rows = [("scene.npz", *row) for row in SCENE_FIELDS] + [tuple(row) for row in VIEW_MEMBERS]
+    fields = [("scene.npz", *row) for row in SCENE_FIELDS] + [*VIEW_MEMBERS]
+    rows = [[*(Cell(name, kind="code") for name in names), meaning] for *names, meaning in fields]
     return [
         Table(("member", "field", "shape", "dtype", "unit, frame, range"), rows),
         Text(
@@ -254,7 +255,7 @@ def field_blocks(dataset: Dataset) -> list[Block]:
             "of a normal 3e-5, of a material 2.5e-4):"
         ),
         Code(READ.strip()),
-        Table(("range of", "least", "median", "largest"), ranges(dataset.measured)),
+        Table(("range of", "least", "median", "largest"), ranges(dataset.measured), numeric=True),
     ]
 
 
@@ -275,7 +276,7 @@ def count_blocks(dataset: Dataset) -> list[Block]:
             "with them the test scenes, follows from the seeds below; two copies whose test digests agree give comparable "
             "numbers. Walls, lights and the simple shapes of special scenes are made by code and belong to no split."
         ),
-        Table(("kind of scene", "scenes"), [(kind, f"{count:,}") for kind, count in sorted(kinds.items())]),
+        Table(("kind of scene", "scenes"), [(kind, f"{count:,}") for kind, count in sorted(kinds.items())], numeric=True),
     ]
 
 
