@@ -37,11 +37,11 @@ stages.renderformer.records
 stages
 stages.graphics.geometry  stages.graphics.statistics  stages.graphics.video  stages.graphics.device  stages.graphics.denoising
 stages.graphics.metrics  stages.graphics.exr
-stages.graphics.arrays  stages.graphics.tonemap
+stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.page
 stages.graphics
 model.renderformer
 model.training
-model.lpips
+model.lpips  model.timing
 model.errors
 model
 pipeline.__main__  pipeline.job  pipeline.commands

@@ -115,8 +115,8 @@ def note_objects(objects: dict[str, Any], meta: dict[str, Any]) -> None:
     """Add the objects of a scene: the hash of its mesh, where each is from and under which licence."""
     for entry in meta["objects"]:
         if entry.get("object_id"):
-            told = {name: entry.get(name) for name in ("content_hash", "family", "source", "origin", "licence")}
-            objects.setdefault(entry["object_id"], {**told, "scenes": 0})["scenes"] += 1
+            origin = {name: entry.get(name) for name in ("content_hash", "family", "source", "origin", "licence")}
+            objects.setdefault(entry["object_id"], {**origin, "scenes": 0})["scenes"] += 1
 
 
 def merge(scene: Record, render: Record) -> Record:

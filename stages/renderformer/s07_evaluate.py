@@ -132,11 +132,11 @@ class Evaluate(MapStage):
                 "constant": constant[number],
                 "direct": measure_all(target, sample.views[camera].direct, worker.metrics),
             }
-            shown = {
+            view_facts = {
                 "roughness": visible_roughness(scene, sample.views[camera].triangle),
                 "noise": view_noise(scene.meta, camera),
             }
-            rows.append({"index": camera, **shown, "scores": scores})
+            rows.append({"index": camera, **view_facts, "scores": scores})
             members[f"view{camera}.prediction.exr"] = encode_rgb(prediction)
         facts = {
             "id": item.id,
