@@ -103,7 +103,7 @@ class Attention(Probe):
         config, scene = worker.config, worker.base(item.id)
         prediction = worker.predict(scene)  # first: it says what is wrong with a resolution
         view = worker.trace(scene)
-        drawn = worker.trace(scene, config.drawn_px, max_spp=1, target_error=0.0, denoise=False).triangle
+        drawn = worker.trace(scene, resolution=config.drawn_px, max_spp=1, target_error=0.0, denoise=False).triangle
         patch = worker.model.config.patch_size
         bundles = choose_bundles(view.triangle, scene.object_index, config.bundles, patch)
         weights = cross_attention(worker.model, scene, config.resolution, worker.device)[:, bundles]

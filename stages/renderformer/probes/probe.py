@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -25,6 +25,7 @@ from stages.graphics.arrays import pack_json, unpack_json
 from stages.graphics.metrics import METRICS, Metric
 from stages.renderformer.probes import edits
 from stages.renderformer.records import SceneRecord
+from stages.renderformer.rendering.settings import RenderSettings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -107,19 +108,14 @@ class Worker:
             raise UserError(f"the model's prediction of scene {scene.id} holds NaN or infinity: training has diverged")
         return image
 
-    def trace(self, scene: SceneRecord, resolution: int | None = None, **options: Any) -> ViewRecord:
-        """The scene's first camera, path traced as the config says."""
+    def trace(self, scene: SceneRecord, **changes: Any) -> ViewRecord:
+        """The scene's first camera, path traced as the config says but for ``changes``: fields of `RenderSettings`."""
         from stages.renderformer.rendering.render import render_views
 
-        config = self.config
+        config, seed = self.config, seed_for(self.config.seed, "probe/trace", scene.id)
+        settings = replace(RenderSettings(config.resolution, config.max_spp, seed, config.target_error), **changes)
         threads = os.environ.get("LIGHTMILL_THREADS")  # set by the engine in worker processes
-        settings = {
-            "max_spp": config.max_spp,
-            "target_error": config.target_error,
-            "seed": seed_for(config.seed, "probe/trace", scene.id),
-            "threads": int(threads) if threads else None,
-        }
-        return render_views(scene, resolution or config.resolution, backend=self.renderer, views=[0], **settings | options)[0]
+        return render_views(scene, settings, self.renderer, [0], int(threads) if threads else None)[0]
 
     def rng(self, purpose: str, scene_id: str) -> np.random.Generator:
         """Random numbers of a scene, the same for every value of the setting."""
@@ -221,7 +217,7 @@ class Sweep(Probe):
         value = {slug(value): value for value in config.values}[name]
         resolution = self.resolution(config, value)
         scene = self.scene(worker, scene_id, value)
-        view = worker.trace(scene, resolution)
+        view = worker.trace(scene, resolution=resolution)
         if view.meta["status"] == "too_close":
             raise Reject("too_close", f"nearest {view.meta['nearest']}")
         if not view.image.any():

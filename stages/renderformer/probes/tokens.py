@@ -70,7 +70,9 @@ class Tokens(Probe):
         config, scene = worker.config, worker.base(item.id)
         arrays = {}
         if item.group == config.split:
-            arrays["seen"] = worker.trace(scene, config.drawn_px, max_spp=1, target_error=0.0, denoise=False).triangle
+            arrays["seen"] = worker.trace(
+                scene, resolution=config.drawn_px, max_spp=1, target_error=0.0, denoise=False
+            ).triangle
             faces = np.unique(arrays["seen"][arrays["seen"] >= 0])
         else:
             faces = worker.rng("tokens", item.id).permutation(len(scene.triangles))
@@ -147,7 +149,7 @@ class Tokens(Probe):
             sheets = [np.where(told["met"][..., None], sheet, 0) for sheet in sheets]
             drawn = [draw_textures(scene, told["seen"], told["faces"], sheet) for sheet in sheets]
             exposure = exposure_for(drawn[0])
-            picture = worker.trace(scene, config.drawn_px).image
+            picture = worker.trace(scene, resolution=config.drawn_px).image
             top = outer[2 * number].subgridspec(1, len(titles))
             for column, image in enumerate([picture, *drawn]):
                 axes = figure.add_subplot(top[column])
