@@ -138,18 +138,18 @@ class Probe:
 
     def scene_ids(self, config: Any, inputs: Inputs) -> list[str]:
         """The scenes that the probe works on."""
-        shard, found = inputs["shard"], []
+        shard, scene_ids = inputs["shard"], []
         for scene_id in shard.ids(config.split):
             if self.suits(unpack_json(shard.read(scene_id, ("meta.json",)).members["meta.json"])):
-                found.append(scene_id)
-                if len(found) == config.scenes:
+                scene_ids.append(scene_id)
+                if len(scene_ids) == config.scenes:
                     break
-        if not found:
+        if not scene_ids:
             raise UserError(
                 f"probe={self.name}: the {config.split} split has {len(shard.ids(config.split))} scenes and none of them "
                 "suits this probe: make more scenes (scene.count), or choose another probe.split"
             )
-        return found
+        return scene_ids
 
     def items(self, config: Any, inputs: Inputs) -> Iterator[Item]:
         raise NotImplementedError
