@@ -107,12 +107,19 @@ def bytes_and_speed(dataset: ShardDataset, count: int, folder: Path, what: set[s
     released = n / cpu(read_released)
     row("released HDF5 read, no images", f"{released:,.1f}")
     everything = tuple(LAYERS)
-    relit = {"mirror": True, "relight": True, "lighting": Relight(keep=0.8, saturation=0.5), "exposure_stops": 1.0}
+    relit = {
+        "rotate": True,
+        "translate_sigma": 0.25,
+        "mirror": True,
+        "relight": True,
+        "lighting": Relight(keep=0.8, saturation=0.5),
+        "exposure_stops": 1.0,
+    }
     rates = {}
     for label, views, layers in (("no images", 0, ()), ("2 views, image", 2, ()), ("2 views, all layers", 2, everything)):
-        config = BatchConfig(batch_scenes=4, views_per_scene=views, layers=layers, bucket=4, **relit)
+        config = BatchConfig(batch_scenes=4, views_per_scene=views, bucket=4, **relit)
         fresh = ShardDataset(dataset.source.root, dataset.split, cache_mb=0)
-        batches = Batches(fresh, config)
+        batches = Batches(fresh, config, layers=layers)
         steps = n // config.batch_scenes
 
         def load(batches: Batches = batches, steps: int = steps) -> None:
@@ -135,7 +142,10 @@ def bytes_and_speed(dataset: ShardDataset, count: int, folder: Path, what: set[s
     print("the same loader by the clock, 2 views, image (wall)")
     steps = n // 4
     for label, workers in (("threads", 0), ("1 process", 1), ("2 processes", 2)):
-        batches = Batches(ShardDataset(dataset.source.root, dataset.split, cache_mb=0), BatchConfig(batch_scenes=4, **relit))
+        batches = Batches(
+            ShardDataset(dataset.source.root, dataset.split, cache_mb=0),
+            BatchConfig(batch_scenes=4, views_per_scene=2, **relit),
+        )
         stream = prefetch(batches, 0, steps, 4, workers)
         next(stream)  # workers have started
         seconds = wall(lambda s=stream: [None for _ in s])
@@ -168,7 +178,9 @@ def bytes_and_speed(dataset: ShardDataset, count: int, folder: Path, what: set[s
     rate = size / seconds / 1e6
     row("all members, samples in random order, CRC checked", f"{rate:,.0f} MB/s", f"{rate / plain:.0%}")
     forget()
-    batches = Batches(ShardDataset(dataset.source.root, dataset.split, cache_mb=0), BatchConfig(batch_scenes=4, **relit))
+    batches = Batches(
+        ShardDataset(dataset.source.root, dataset.split, cache_mb=0), BatchConfig(batch_scenes=4, views_per_scene=2, **relit)
+    )
     used = sum(len(d) for i in indices for d in members_of(dataset, i, 2, False).values())
     forget()
     seconds = wall(lambda: [batches(step) for step in range(n // 4)])

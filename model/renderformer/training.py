@@ -8,13 +8,11 @@ that step on resume, so nothing is logged twice. Many processes (``model.trainin
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +26,7 @@ from model.renderformer import checkpoint
 from model.renderformer.flops import TRAINING, forward_flops, ideal_seconds, peak_flops
 from model.renderformer.losses import image_loss, log_radiance
 from model.renderformer.network import RenderFormer, to_radiance
+from model.renderformer.recipe import FitConfig
 from model.training.logs import TrainingLog
 from model.training.optimization import Average, optimizers, schedule, set_learning_rate
 from model.training.parallel import Group, accumulating, distribute, gather, scatter
@@ -38,43 +37,6 @@ PATIENCE = 20  # this many non-finite steps in a row stop the run
 
 Batch = Mapping[str, Any]
 Pair = tuple[np.ndarray, np.ndarray]  # a reference and a prediction, each (H, W, 3) radiance
-
-
-@dataclass(frozen=True)
-class FitConfig:
-    """How to train; the paper's values are in ``conf/renderformer/train/paper_256.yaml``."""
-
-    steps: int
-    lr: float = 1e-4
-    warmup: int = 8000  # steps of linear warm-up
-    decay_steps: int | None = None  # step at which the cosine ends; None: the last
-    final_lr: float = 0.0  # learning rate after the cosine, as a share of lr
-    weight_decay: float = 0.01  # on matrices; norms, biases and tokens are left alone
-    clip: float = 1.0  # largest gradient norm
-    optimizer: str = "adamw"  # adamw | muon (2-D hidden weights; AdamW for the rest)
-    muon_lr: float = 0.02  # highest learning rate of Muon's weights: the size of a step in spectral norm
-    ema: float = 0.0  # decay of the averaged weights, which are then the ones validated and saved; 0: none
-    lpips: float = 0.0  # weight of LPIPS(VGG)
-    gradient_leak: float = 0.0  # gradient, beyond ELU's own, of pixels that come out negative: without it they can die
-    # Runtime: these do not change the result, or only its rounding
-    lpips_folder: Path | None = None
-    precision: str = "fp32"  # fp32 | mixed (view-independent stage in bfloat16, TF32 in the other) | bf16
-    micro_scenes: int | None = None  # scenes of a process in memory at once; gradients of the parts add up. None: all
-    activation_checkpointing: bool = False
-    sharded: bool = False  # FSDP instead of DDP, where there are several processes
-    compile: bool = False
-    log_every: int = 50
-    validate_every: int = 1000
-    checkpoint_every: int = 500
-    pictures: int = 6  # validation scenes shown
-
-    RUNTIME = (
-        "lpips_folder", "precision", "micro_scenes", "activation_checkpointing", "sharded", "compile", "log_every",
-        "validate_every", "checkpoint_every", "pictures",
-    )  # fmt: skip
-
-    def identity(self) -> dict[str, Any]:
-        return {name: value for name, value in dataclasses.asdict(self).items() if name not in self.RUNTIME}
 
 
 def predict(forward: Callable[..., Tensor], model: RenderFormer, batch: Batch, device: Any, precision: str) -> Tensor:
@@ -270,23 +232,26 @@ def fit(
     some views. ``trained_with`` goes into the checkpoints. Returns steps, skipped, seconds, and the last and best
     validation's metrics.
     """
-    if config.precision not in ("fp32", "mixed", "bf16"):
-        raise InputError(f"precision={config.precision!r} is unknown: fp32, mixed or bf16")
+    precision = config.precision_on(group.device.type)
     folder.mkdir(parents=True, exist_ok=True)
     model.to(group.device).train()
     model.view_transformer.gradient_leak = config.gradient_leak
     model.activation_checkpointing(config.activation_checkpointing)
-    if config.precision != "fp32" and group.device.type == "cuda":
+    if precision != "fp32" and group.device.type == "cuda":
         torch.set_float32_matmul_precision("high")
     if config.compile:
         model.compile_layers()
-    lpips = LPIPS.load(config.lpips_folder).to(group.device) if config.lpips > 0 else None
-    forward = distribute(model, group, config.sharded)
+    lpips = (
+        LPIPS.load(Path(config.lpips_folder).expanduser() if config.lpips_folder else None).to(group.device)
+        if config.lpips > 0
+        else None
+    )
+    forward = distribute(model, group, config.parallel == "fsdp")
     state = _State(model, config, folder, group)
     if state.load() and group.leads:
         say(f"going on from step {state.step:,} of {config.steps:,}")
     parameters = [p for optimizer in state.optimizers for one in optimizer.param_groups for p in one["params"]]
-    work = Work(model, group, config.precision)
+    work = Work(model, group, precision)
     # Only the first process writes. All have read the state by now, and none goes on before the log is cut.
     log = TrainingLog(*((folder, tensorboard) if group.leads else (None, None)), state.step, config.steps,
                       say if group.leads else lambda text: None)  # fmt: skip
@@ -295,7 +260,7 @@ def fit(
 
     def validate() -> dict[str, float]:
         with state.averaged():
-            found, pairs = evaluate(model, validation, group, config.precision, config.pictures if show else 0)
+            found, pairs = evaluate(model, validation, group, precision, config.pictures if show else 0)
         if state.best is None or found["log_error"] < state.best:
             state.best = found["log_error"]
             state.release(folder / BEST, trained_with)
@@ -311,7 +276,7 @@ def fit(
         loss = torch.zeros((), device=group.device)
         for part, weight, last in parts(batch, config.micro_scenes):
             with accumulating(forward, last):
-                y = predict(forward, model, part, group.device, config.precision)
+                y = predict(forward, model, part, group.device, precision)
                 image = torch.from_numpy(np.ascontiguousarray(part["image"])).to(group.device, non_blocking=True)
                 part_loss = weight * image_loss(y, image, lpips, config.lpips)
                 part_loss.backward()

@@ -18,7 +18,7 @@ from pydantic import Discriminator, Tag
 from pipeline.config import StageConfig, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs
-from stages.renderformer.s06_train import OBJECTS, Train, TrainConfig
+from stages.renderformer.s06_train import OBJECTS, Train, TrainConfig, check_objects
 
 FILES = ("config.json", "model.safetensors")
 
@@ -59,6 +59,7 @@ class TrainOrGiven(Train):
             checkpoint.load(files[0].parent)
         except (ValueError, KeyError) as error:
             raise UserError(f"train.checkpoint={config.checkpoint!r} cannot be used: {error}") from error
+        check_objects(f"train.checkpoint={config.checkpoint}", files[0].parent, inputs["shard"], draft.log)
         (draft.files / "checkpoint").mkdir(exist_ok=True)
         for path in files:
             shutil.copyfile(path, draft.files / "checkpoint" / path.name)

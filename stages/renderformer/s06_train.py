@@ -20,17 +20,17 @@ from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 from pydantic import Field, create_model, model_validator
 
 from model.renderformer.config import FIXED, ModelConfig
-from pipeline.config import Section, StageConfig, added, runtime
+from model.renderformer.recipe import FitConfig
+from pipeline.config import Section, StageConfig, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, RunStage
 from stages.graphics.device import choose_device
-from stages.renderformer.dataset import BatchConfig, BatchRecipe
+from stages.renderformer.dataset import BatchConfig
 
 if TYPE_CHECKING:
     import numpy as np
 
     from model.renderformer.network import RenderFormer
-    from model.renderformer.training import FitConfig
     from model.training.parallel import Group
     from pipeline.store import Artifact, Draft
 
@@ -62,81 +62,36 @@ ModelSection = create_model(
 )
 
 
-class TrainConfig(StageConfig, BatchRecipe):
+class TrainConfig(StageConfig, BatchConfig, FitConfig):
+    """The data's and the loop's settings, which are stated with what reads them, and what binds the two."""
+
     model: ModelSection = ModelSection()
-    # Of `BatchRecipe`, with other defaults: minutes are too short to learn every orientation
-    views_per_scene: int = Field(4, ge=1)
-    rotate: bool = False
-    translate_sigma: float = Field(0.0, ge=0)
-    relight: bool = True
     max_triangles: int | None = Field(None, ge=1)  # scenes with more are left out; null: none is
-    # Schedule
-    steps: int = Field(1500, ge=1)
-    lr: float = Field(1e-3, gt=0)
-    warmup: int = Field(50, ge=0)  # steps
-    decay_steps: int | None = Field(None, ge=1)  # step at which the cosine ends; null: the last step
-    final_lr: float = Field(0.0, ge=0, le=1)  # after the cosine, as a share of lr
-    optimizer: Literal["adamw", "muon"] = "muon"
-    muon_lr: float = Field(0.005, gt=0)  # highest learning rate of Muon's weights: a step's size in spectral norm
-    weight_decay: float = Field(0.01, ge=0)
-    clip: float = Field(1.0, gt=0)  # largest gradient norm
-    ema: float = added(0.0, 0.0, ge=0, lt=1)  # decay of the averaged weights that are validated and saved; 0: none
-    # mixed: view-independent stage in bfloat16 and TF32 in the other on a GPU, fp32 on a CPU; bf16: all in bfloat16, anywhere
-    precision: Literal["mixed", "fp32", "bf16"] = "mixed"
     init_from: str | None = runtime(None)  # checkpoint folder or train artifact to start from; its content counts, not its path
-    # Loss: L1 on log10(1 + x) + lpips * LPIPS(VGG)
-    lpips: float = Field(0.0, ge=0)
-    # Share of the gradient that pixels below 0 get besides ELU's own 1e-3: at high learning rates the output else dies
-    gradient_leak: float = Field(0.1, ge=0, le=1)
     # Initial values that say what is known (model.renderformer.initial), for runs of minutes.
     # inputs: of materials and normals, not of rays
     informed_start: bool | Literal["inputs"] = True
     # Runtime
-    lpips_folder: str | None = runtime(None)  # folder with the published LPIPS weights
-    micro_scenes: int | None = runtime(None, ge=1)  # scenes of a process in memory at once, gradients add up; null: all
-    activation_checkpointing: bool = runtime(False)  # compute activations again instead of keeping them
-    parallel: Literal["ddp", "fsdp"] = runtime("ddp")  # under torchrun: whole models, or one split over the processes
     device: str = runtime("auto")  # auto | cpu | cuda
-    compile: bool = runtime(False)  # torch.compile
     threads: int | None = runtime(None, ge=1)  # CPU threads; null: torch's choice
     ahead: int = runtime(4, ge=1)  # batches that are read ahead
     loader_workers: int = runtime(0, ge=0)  # processes that decode them; 0: threads of this one
     skip_damaged_shards: bool = runtime(False)  # go on without the samples of shards that are missing or cut
-    log_every: int = runtime(50, ge=1)  # steps
-    validate_every: int = runtime(200, ge=1)
     validation_scenes: int = runtime(16, ge=1)
     validate_on: Literal["validation", "train"] = runtime("validation")  # train: how well it fits what it sees
-    pictures: int = runtime(6, ge=0)  # validation scenes that are shown
-    checkpoint_every: int = runtime(100, ge=1)
     tensorboard: bool = runtime(True)  # events besides log.jsonl
 
     @model_validator(mode="after")
     def _startable(self) -> TrainConfig:
         model = self.model
+        if self.views_per_scene < 1:
+            raise ValueError("views_per_scene=0 leaves nothing to learn from: give each scene at least one view")
         if self.informed_start is True and self.init_from is None and not (model.pe_type == "rope" and model.turn_to_cam_coord):
             raise ValueError(
                 f"informed_start=true aims rays by rotary positions in the camera frame, which {model.name} does not have: "
                 "set train.informed_start=inputs or false"
             )
         return self
-
-    def batches(self) -> BatchConfig:
-        """The loader's part."""
-        return BatchConfig(**{name: getattr(self, name) for name in BatchRecipe.model_fields})
-
-    def fit(self, device: str) -> FitConfig:
-        """The loop's part: the fields of the same names."""
-        import dataclasses
-
-        from model.renderformer.training import FitConfig
-
-        names = {field.name for field in dataclasses.fields(FitConfig)} & type(self).model_fields.keys()
-        values = {name: getattr(self, name) for name in names} | {
-            "lpips_folder": Path(self.lpips_folder).expanduser() if self.lpips_folder else None,
-            "precision": "fp32" if self.precision == "mixed" and device == "cpu" else self.precision,
-            "sharded": self.parallel == "fsdp",
-        }
-        return FitConfig(**values)
 
 
 class Train(RunStage):
@@ -201,11 +156,11 @@ class Train(RunStage):
         validation = train
         if config.validate_on != "train":
             validation = ShardDataset(inputs["shard"], config.validate_on, config.max_triangles, skip_damaged_shards=skip)
-        batches = Batches(train, config.batches(), group.rank, group.world)
+        batches = Batches(train, config, group.rank, group.world)
         held_out = list(itertools.islice(evaluation_samples(validation), config.validation_scenes))
 
         if config.init_from is not None:
-            check_objects(config, inputs["shard"], say)
+            check_objects(f"train.init_from={config.init_from}", initial_folder(config.init_from), inputs["shard"], say)
         torch.manual_seed(config.seed)
         model = RenderFormer(config.model.build())
         start(model, config)
@@ -224,7 +179,7 @@ class Train(RunStage):
         damaged: dict[str, str] = {}
         summary = fit(
             model,
-            config.fit(group.device.type),
+            config,
             lambda start, stop: name_damaged(prefetch(batches, start, stop, config.ahead, config.loader_workers), damaged, say),
             held_out,
             state,
@@ -302,22 +257,24 @@ def training_objects(config: TrainConfig, shard: Artifact) -> TrainingObjects:
     return TrainingObjects(before.objects | own, before.complete and bool(own))
 
 
-def check_objects(config: TrainConfig, shard: Artifact, say: Callable[[str], None]) -> None:
-    """Refuse to start from a model that was trained on objects of the test split. Content decides, as made-up objects have the
-    same ids for every seed."""
-    before = TrainingObjects.read(initial_folder(config.init_from))
-    seen = set(before.objects.values())
-    leaked = [id for id, content in sorted(split_objects(shard, "test").items()) if content in seen]
+def check_objects(setting: str, folder: Path, shard: Artifact, say: Callable[[str], None]) -> None:
+    """Refuse the model in the checkpoint folder that ``setting`` names if it was trained on objects of the test split.
+
+    Content decides, as made-up objects have the same ids for every seed.
+    """
+    training = TrainingObjects.read(folder)
+    contents = set(training.objects.values())
+    leaked = [id for id, content in sorted(split_objects(shard, "test").items()) if content in contents]
     if leaked:
         names = ", ".join([*leaked[:5], *["..."] * (len(leaked) > 5)])
         raise UserError(
-            f"train.init_from={config.init_from} was trained on {len(leaked)} object(s) of the test split ({names}), so its "
-            "test would say nothing: start from another model or from scratch"
+            f"{setting} was trained on {len(leaked)} object(s) of the test split ({names}), so its test would say nothing: "
+            "choose another model, or other test scenes"
         )
-    if not before.complete:
+    if not training.complete:
         say(
-            f"warning: nobody knows all objects that train.init_from={config.init_from} was trained on ({OBJECTS} is missing "
-            "there or in what it started from): some may be in the test split"
+            f"warning: nobody knows all objects that {setting} was trained on ({OBJECTS} is missing there or in what it "
+            "started from): some may be in the test split"
         )
 
 

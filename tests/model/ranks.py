@@ -14,7 +14,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from model.renderformer.config import ModelConfig  # noqa: E402
 from model.renderformer.network import RenderFormer  # noqa: E402
-from model.renderformer.training import FitConfig, fit  # noqa: E402
+from model.renderformer.recipe import FitConfig  # noqa: E402
+from model.renderformer.training import fit  # noqa: E402
 from model.training.parallel import join  # noqa: E402
 from tests.model.synthetic import batch  # noqa: E402
 from tests.model.test_config import MICRO  # noqa: E402
@@ -39,8 +40,8 @@ def main() -> None:
         torch.manual_seed(0)
         model = RenderFormer(ModelConfig(**MICRO))
         config = FitConfig(
-            steps=STEPS, lr=1e-3, warmup=5, ema=0.9, sharded=parallel == "fsdp", micro_scenes=1, log_every=1,
-            validate_every=10, checkpoint_every=20,
+            steps=STEPS, lr=1e-3, warmup=5, optimizer="adamw", gradient_leak=0.0, ema=0.9, parallel=parallel, micro_scenes=1,
+            log_every=1, validate_every=10, checkpoint_every=20,
         )  # fmt: skip
         fit(model, config, batches, [batch(1000 + i) for i in range(3)], Path(folder), group, lambda text: None)
 

@@ -14,7 +14,8 @@ from model.renderformer import checkpoint
 from model.renderformer.config import ModelConfig
 from model.renderformer.flops import forward_flops
 from model.renderformer.network import RenderFormer
-from model.renderformer.training import BEST, LAST, FitConfig, Work, fit, predict
+from model.renderformer.recipe import FitConfig
+from model.renderformer.training import BEST, LAST, Work, fit, predict
 from model.training.logs import LOG
 from model.training.optimization import schedule
 from model.training.parallel import Group
@@ -27,7 +28,8 @@ MEASURED = ("seconds", "scenes_per_s", "tokens_per_s", "memory_gb", "mfu")  # of
 
 
 def settings(**fields) -> FitConfig:
-    return FitConfig(**(dict(steps=STEPS, lr=1e-3, warmup=3, log_every=4, validate_every=7, checkpoint_every=5) | fields))
+    plain = dict(steps=STEPS, lr=1e-3, warmup=3, optimizer="adamw", gradient_leak=0.0)
+    return FitConfig(**(plain | dict(log_every=4, validate_every=7, checkpoint_every=5) | fields))
 
 
 def stream(start: int, stop: int):

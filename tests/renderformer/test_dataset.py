@@ -18,7 +18,6 @@ from stages.renderformer.dataset import (
     Batches,
     DamagedSample,
     DamagedShard,
-    Loader,
     Relight,
     ShardDataset,
     collate,
@@ -33,10 +32,10 @@ from stages.renderformer.dataset import (
 )
 from tests.renderformer.fakes import sharded
 
-PLAIN = BatchConfig(rotate=False, translate_sigma=0.0, layers=("direct",))
+PLAIN = BatchConfig(views_per_scene=2, rotate=False, translate_sigma=0.0, relight=False)
 EVERYTHING = BatchConfig(
     mirror=True, relight=True, lighting=Relight(share=0.8, keep=0.5, saturation=1.0), exposure_stops=1.0, bucket=2,
-    layers=("normal", "depth", "triangle"),
+    rotate=True, translate_sigma=0.25, views_per_scene=2,
 )  # fmt: skip
 
 
@@ -65,7 +64,7 @@ def project(example: dict, points: np.ndarray) -> np.ndarray:
 
 
 def test_without_augmentation_the_stored_arrays(artifact, dataset):
-    batch = Batches(dataset, PLAIN)(0)
+    batch = Batches(dataset, PLAIN, layers=("direct",))(0)
     assert batch["image"].shape == (4, 2, 12, 12, 3) and len(batch["ids"]) == 4
     assert batch["mask"].shape[1] == batch["mask"].sum(axis=1).max()
     for i, id in enumerate(batch["ids"]):
@@ -235,8 +234,8 @@ def test_only_what_is_wanted_is_decoded(artifact, monkeypatch):
 
 
 def test_layers_that_are_not_there_are_named(dataset):
-    with pytest.raises(ValueError, match="layers albdo are unknown: choose from direct, albedo"):
-        BatchConfig(layers=("albdo",))
+    with pytest.raises(UserError, match="layers albdo are unknown: choose from direct, albedo"):
+        Batches(dataset, PLAIN, layers=("albdo",))
     with pytest.raises(UserError, match=r"read them with layers=\['triangle'\]"):
         make_example(dataset.read(0, [2]), np.array([2]), None, ("triangle",))
     assert "image" not in Batches(dataset, BatchConfig(views_per_scene=0))(0)
@@ -261,15 +260,14 @@ def test_every_epoch_visits_every_scene_once_whatever_the_buckets(many, bucket, 
 
 
 def test_buckets_waste_less_and_the_stated_waste_is_that_of_the_batches(many):
-    def waste(**fields) -> float:
+    def waste_of(**fields) -> float:
         batches = Batches(many, BatchConfig(batch_scenes=4, **fields))
-        told = batches.padding_waste(0, 13)
+        waste = batches.padding_waste(0, 13)
         masks = [batches(step)["mask"] for step in range(13)]
-        assert told == pytest.approx(1 - sum(mask.sum() for mask in masks) / sum(mask.size for mask in masks))
-        return told
+        assert waste == pytest.approx(1 - sum(mask.sum() for mask in masks) / sum(mask.size for mask in masks))
+        return waste
 
-    assert waste(bucket=3) < 0.8 * waste() < waste(pad_multiple=256)
-    assert Batches(many, BatchConfig(pad_multiple=64))(0)["mask"].shape[1] % 64 == 0
+    assert waste_of(bucket=3) < 0.8 * waste_of()
     halves = Batches(many, BatchConfig(batch_scenes=4, bucket=3), 0, 2)
     assert halves.padding_waste(0, 13) <= Batches(many, halves.config).padding_waste(0, 13)
 
@@ -293,22 +291,22 @@ def test_two_ranks_with_two_workers_are_one_rank(many):
 
 RUN = """
 import json, sys
-from stages.renderformer.dataset import BatchConfig, Batches, Loader, ShardDataset
+from stages.renderformer.dataset import BatchConfig, Batches, ShardDataset, prefetch
 
 root, state, workers, kill = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
 config = BatchConfig(batch_scenes=4, mirror=True, bucket=2)
-loader = Loader(Batches(ShardDataset(root, "train"), config), stop=12, workers=workers)
 try:
-    loader.load_state_dict(json.load(open(state)))
+    start = int(open(state).read())
 except FileNotFoundError:
-    pass
-for batch in loader:
+    start = 0
+batches = Batches(ShardDataset(root, "train"), config)
+for step, batch in enumerate(prefetch(batches, start, 12, ahead=4, workers=workers), start=start):
     print(json.dumps([batch["ids"], float(batch["image"].sum()), float(batch["triangles"].sum())]), flush=True)
     with open(state + ".tmp", "w") as file:
-        json.dump(loader.state_dict(), file)
+        file.write(str(step + 1))
     import os
     os.replace(state + ".tmp", state)
-    if loader.step == kill:
+    if step + 1 == kill:
         os.kill(os.getpid(), 9)
 """
 
@@ -326,16 +324,9 @@ def test_killed_at_a_random_step_it_goes_on_with_the_very_next_batch(many, tmp_p
     assert run("b", 2, kill) + run("b", 1, 99) == undisturbed, f"killed after step {kill}"
 
 
-def test_state_belongs_to_one_sequence(many):
-    loader = Loader(Batches(many, PLAIN), stop=5)
-    last = next(batch for batch in loader if loader.step == 3)
-    assert loader.state_dict()["step"] == 3 and json.loads(json.dumps(loader.state_dict())) == loader.state_dict()
-    other = Loader(Batches(many, PLAIN, 1, 2), stop=5)  # more ranks, same sequence
-    other.load_state_dict(loader.state_dict())
-    assert [batch["ids"] for batch in other] == [Batches(many, PLAIN)(step)["ids"][2:] for step in (3, 4)]
-    assert last["ids"] == Batches(many, PLAIN)(2)["ids"] and 0 < loader.padded < 1
-    with pytest.raises(UserError, match="another sequence"):
-        Loader(Batches(many, PLAIN.model_copy(update={"seed": 1}))).load_state_dict(loader.state_dict())
+def test_going_on_with_more_ranks_is_the_same_sequence(many):
+    rest = list(prefetch(Batches(many, PLAIN, 1, 2), 3, 5))
+    assert [batch["ids"] for batch in rest] == [Batches(many, PLAIN)(step)["ids"][2:] for step in (3, 4)]
 
 
 # --- damage -----------------------------------------------------------------------------------------------------------
@@ -364,12 +355,11 @@ def test_a_damaged_sample_is_skipped_by_name(copy):
         flip(root, row, name)
     bad = {rows[3]["id"], rows[7]["id"]}
     config = BatchConfig(batch_scenes=4, bucket=1)
-    clean, told = Batches(ShardDataset(root, "train"), config), []
-    loader = Loader(clean, stop=7, log=told.append)
-    batches = list(loader)
+    clean = Batches(ShardDataset(root, "train"), config)
+    batches = list(prefetch(clean, 0, 7))
     assert all(len(batch["ids"]) == 4 and not bad & set(batch["ids"]) for batch in batches)  # no batch is short
-    assert set(loader.damaged) == bad and len(told) == 2
-    assert all(any(f"sample {id} is skipped" in line and "CRC-32" in line for line in told) for id in bad)
+    reasons = dict(pair for batch in batches for pair in batch["damaged"])
+    assert set(reasons) == bad and all("CRC-32" in reason for reason in reasons.values())
     again = list(prefetch(clean, 0, 7, workers=2))
     assert all(same(a, b) for a, b in zip(batches, again, strict=True))  # damage is part of the data: still a pure function
     with pytest.raises(DamagedSample, match=rows[3]["id"]):
@@ -401,10 +391,10 @@ def test_a_damaged_shard_stops_the_run_unless_told_otherwise(copy):
     os.unlink(root / shard)
     with pytest.raises(DamagedShard, match="is missing"):
         ShardDataset(root, "train")
-    told = []
-    loader = Loader(Batches(ShardDataset(root, "train", skip_damaged_shards=True), PLAIN), stop=7, log=told.append)
-    assert lost and all(not lost & set(batch["ids"]) for batch in loader)
-    assert set(loader.damaged) <= lost and told
+    batches = list(prefetch(Batches(ShardDataset(root, "train", skip_damaged_shards=True), PLAIN), 0, 7))
+    assert lost and all(not lost & set(batch["ids"]) for batch in batches)
+    reasons = dict(pair for batch in batches for pair in batch["damaged"])
+    assert reasons and set(reasons) <= lost
 
 
 def test_a_shard_that_is_cut_during_the_run_stops_it(copy):

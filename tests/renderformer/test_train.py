@@ -213,6 +213,30 @@ def test_a_given_checkpoint_is_planned_without_a_cost(tmp_path):
     assert re.search(r"06 train +to make", text) and "07 evaluate" in text and "training:" not in text
 
 
+def test_a_given_model_is_not_tested_on_objects_that_it_was_trained_on(trained, shard, tmp_path):
+    from stages.renderformer.s06_given import GivenConfig, TrainOrGiven
+
+    given = tmp_path / "given"
+    shutil.copytree(trained[0].files / "checkpoint", given)
+
+    def give(number: int) -> list[str]:
+        draft = FakeArtifact(tmp_path / str(number), [])
+        lines = []
+        draft.log = lines.append
+        TrainOrGiven().run(GivenConfig(checkpoint=str(given)), {"shard": shard}, draft)
+        return lines
+
+    assert give(0) == []
+    tested, content = next(
+        (id, o["content_hash"]) for id, o in json.loads(shard.file("objects.json").read_text())["test"].items()
+    )
+    (given / "objects.json").write_text(json.dumps({"objects": {"another-name": content}, "complete": True}))
+    with pytest.raises(UserError, match=rf"train\.checkpoint=.* was trained on 1 object\(s\) of the test split \({tested}\)"):
+        give(1)
+    (given / "objects.json").unlink()
+    assert ["some may be in the test split" in line for line in give(2)] == [True]
+
+
 def test_resolution_must_suit_the_model(shard, tmp_path):
     draft = FakeArtifact(tmp_path, [])
     draft.state = tmp_path / "state"

@@ -24,17 +24,15 @@ from stages.renderformer.dataset.augment import (
     move,
     rotation_from_vector,
 )
-from stages.renderformer.dataset.loader import BatchConfig, Batches, BatchRecipe, Loader, evaluation_samples, prefetch
+from stages.renderformer.dataset.loader import BatchConfig, Batches, evaluation_samples, prefetch
 from stages.renderformer.dataset.shards import DamagedSample, DamagedShard, Sample, ShardDataset, decode_members, decode_sample
 
 __all__ = [
     "Batch",
     "BatchConfig",
-    "BatchRecipe",
     "Batches",
     "DamagedSample",
     "DamagedShard",
-    "Loader",
     "Relight",
     "Sample",
     "ShardDataset",

@@ -165,8 +165,8 @@ def planes(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     return np.moveaxis(np.empty((*shape[:-3], 3, *shape[-3:-1]), dtype), -3, -1)
 
 
-def collate(examples: Iterable[Batch], count: int, pad_multiple: int = 1) -> Batch:
-    """``count`` examples stacked; triangles padded with zeros to the longest, rounded up to a multiple of ``pad_multiple``.
+def collate(examples: Iterable[Batch], count: int) -> Batch:
+    """``count`` examples stacked; triangles padded with zeros to the longest.
 
     A generator is asked for one example after the other, whose pixels are copied and let go before the next one's are decoded:
     memory used again at once costs far less than fresh memory.
@@ -180,7 +180,7 @@ def collate(examples: Iterable[Batch], count: int, pad_multiple: int = 1) -> Bat
             pixels[name][len(rest)] = example[name]
         rest.append({name: None if name in pixels else value for name, value in example.items()})
         del example
-    longest = -(-max(len(example["mask"]) for example in rest) // pad_multiple) * pad_multiple
+    longest = max(len(example["mask"]) for example in rest)
     batch: Batch = {"ids": [example["id"] for example in rest]}
     textured = [example for example in rest if "patches" in example]
     if textured:

@@ -7,8 +7,6 @@ decide who computes a step. So to resume is to remember one number.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import threading
 from collections import deque
@@ -17,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from pipeline.config import Section, added
 from pipeline.errors import UserError
@@ -39,45 +37,36 @@ from stages.renderformer.views import LAYERS
 MOST_DAMAGED = 64  # samples in a row that cannot be read before it is the dataset that is damaged
 
 
-class BatchRecipe(Section):
-    """What a training batch holds, as far as a recipe says it: a part of *train*'s config."""
+class BatchConfig(Section):
+    """What a training batch holds; a part of *train*'s config. The defaults suit runs of minutes."""
 
     seed: int = 0
     batch_scenes: int = Field(4, ge=1)  # over all ranks
-    views_per_scene: int = Field(2, ge=0)  # 0: no images; a scene is encoded once for all of its views
-    rotate: bool = True  # rotation vector ~ N(0, I): the view-independent stage must not learn an orientation
-    translate_sigma: float = Field(0.25, ge=0)  # scene units, translation ~ N(0, sigma^2 I)
+    views_per_scene: int = Field(4, ge=0)  # 0: no images; a scene is encoded once for all of its views
+    rotate: bool = False  # rotation vector ~ N(0, I): the view-independent stage must not learn an orientation
+    translate_sigma: float = Field(0.0, ge=0)  # scene units, translation ~ N(0, sigma^2 I)
     mirror: bool = False  # x -> -x, for half of the samples
-    relight: bool = False  # reweight the lights' own images: light transport is linear
+    relight: bool = True  # reweight the lights' own images: light transport is linear
     lighting: Relight = Relight()  # what relight draws from
     exposure_stops: float = added(0.0, 0.0, ge=0)  # radiance, seen and emitted, times 2^U(-stops, stops)
     shuffle_shards: int = added(0, 0, ge=0)  # scenes are shuffled over this many shards at a time; 0: over the whole split
     bucket: int = added(0, 0, ge=0)  # global batches whose scenes are sorted by triangle count together; 0: none
 
 
-class BatchConfig(BatchRecipe):
-    """What a training batch holds: the recipe, and what only code asks for."""
-
-    layers: tuple[str, ...] = ()  # AOV layers that a batch holds besides the image; only then are they read
-    pad_multiple: int = Field(1, ge=1)  # the padded number of triangles is a multiple of it: few shapes for compilers
-
-    @field_validator("layers")
-    @classmethod
-    def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        if unknown := set(names) - LAYERS.keys():
-            raise ValueError(f"layers {', '.join(sorted(unknown))} are unknown: choose from {', '.join(LAYERS)}")
-        return names
-
-
 class Batches:
-    """``batches(step)``: the batch of a step. Rank r of ``world`` gets its slice of the same global batch."""
+    """``batches(step)``: the batch of a step. Rank r of ``world`` gets its slice of the same global batch.
 
-    def __init__(self, dataset: ShardDataset, config: BatchConfig, rank: int = 0, world: int = 1):
+    ``layers``: the AOV layers that a batch holds besides the image; only then are they read.
+    """
+
+    def __init__(self, dataset: ShardDataset, config: BatchConfig, rank: int = 0, world: int = 1, layers: tuple[str, ...] = ()):
+        if unknown := set(layers) - LAYERS.keys():
+            raise UserError(f"layers {', '.join(sorted(unknown))} are unknown: choose from {', '.join(LAYERS)}")
         if config.batch_scenes % world:
             raise UserError(
                 f"batch_scenes={config.batch_scenes} cannot be shared by {world} processes: make it a multiple of {world}"
             )
-        self.dataset, self.config, self.rank, self.world = dataset, config, rank, world
+        self.dataset, self.config, self.rank, self.world, self.layers = dataset, config, rank, world, layers
         self._orders: dict[int, np.ndarray] = {}
         self._lock = threading.Lock()
 
@@ -93,7 +82,7 @@ class Batches:
         first = step * self.config.batch_scenes + self.rank * share
         damaged: dict[str, str] = {}
         examples = (self._example(position, damaged) for position in range(first, first + share))
-        return collate(examples, share, self.config.pad_multiple) | {"damaged": sorted(damaged.items())}
+        return collate(examples, share) | {"damaged": sorted(damaged.items())}
 
     def order(self, epoch: int) -> np.ndarray:
         """(len(dataset),) indices in the order of that epoch: each exactly once.
@@ -132,14 +121,8 @@ class Batches:
         scenes, share = self.config.batch_scenes, self.config.batch_scenes // self.world
         positions = range(first_step * scenes, (first_step + steps) * scenes)
         counts = np.array([self.dataset.triangles[self._index(position)[1]] for position in positions]).reshape(-1, share)
-        multiple = self.config.pad_multiple
-        longest = -(-counts.max(axis=1) // multiple) * multiple
+        longest = counts.max(axis=1)
         return float(1 - counts.sum() / (longest * share).sum())
-
-    def sequence(self) -> str:
-        """Hex digest of all that decides which batch follows which: not of rank, world or workers."""
-        recipe = json.dumps([self.config.model_dump(mode="json"), self.dataset.split, self.dataset.ids], sort_keys=True)
-        return hashlib.blake2b(recipe.encode() + self.dataset.triangles.tobytes(), digest_size=16).hexdigest()
 
     def _index(self, position: int) -> tuple[int, int]:
         """Epoch and dataset index at that position of the endless sequence of epochs."""
@@ -163,9 +146,9 @@ class Batches:
         rng = np.random.default_rng(seed_for(config.seed, "augment", f"{epoch}/{row['id']}"))
         kept, wanted = np.array(row["views"]), config.views_per_scene
         views = rng.choice(kept, size=wanted, replace=wanted > len(kept))
-        sample = self.dataset.read(index, views, config.layers, None)
+        sample = self.dataset.read(index, views, self.layers, None)
         factors = draw_light_factors(config.lighting, rng, sample.scene.n_lights) if config.relight else None
-        example = make_example(sample, views, factors, config.layers)
+        example = make_example(sample, views, factors, self.layers)
         if config.mirror and rng.random() < 0.5:
             example = mirror(example)
         if config.rotate or config.translate_sigma:
@@ -281,53 +264,3 @@ def _one_thread(worker: int) -> None:
 
     torch.set_num_threads(1)
     os.environ["OMP_NUM_THREADS"] = "1"
-
-
-class Loader:
-    """Batches one after the other, and where it stands.
-
-    ``workers`` as in ``prefetch``; neither they nor ``ahead`` nor the ranks change what comes out. ``damaged`` maps ids of
-    samples that could not be read to the reason; each is logged once.
-    """
-
-    def __init__(
-        self,
-        batches: Batches,
-        *,
-        stop: int | None = None,
-        workers: int = 0,
-        ahead: int = 4,
-        log: Callable[[str], None] = print,
-    ):
-        self.batches, self.stop, self.workers, self.ahead, self.log = batches, stop, workers, ahead, log
-        self.step = 0  # of the next batch
-        self.damaged: dict[str, str] = {}
-        self._triangles = self._slots = 0
-
-    def __iter__(self) -> Iterator[Batch]:
-        for batch in prefetch(self.batches, self.step, self.stop, self.ahead, self.workers):
-            for id, reason in batch["damaged"]:
-                if id not in self.damaged:
-                    self.damaged[id] = reason
-                    self.log(f"sample {id} is skipped: {reason}")
-            self._triangles += int(batch["mask"].sum())
-            self._slots += batch["mask"].size
-            self.step += 1
-            yield batch
-
-    @property
-    def padded(self) -> float:
-        """Share of the triangles handed out so far that were padding."""
-        return 1 - self._triangles / self._slots if self._slots else 0.0
-
-    def state_dict(self) -> dict[str, Any]:
-        """Where to go on: after the batches that were handed out, whatever was read ahead."""
-        return {"step": self.step, "sequence": self.batches.sequence()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        if state["sequence"] != self.batches.sequence():
-            raise UserError(
-                "the loader's state belongs to another sequence of batches: dataset, split, seed, batch_scenes and "
-                "augmentation must be those of the run that saved it"
-            )
-        self.step = int(state["step"])
