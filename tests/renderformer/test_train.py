@@ -237,6 +237,22 @@ def test_a_given_model_is_not_tested_on_objects_that_it_was_trained_on(trained, 
     assert ["some may be in the test split" in line for line in give(2)] == [True]
 
 
+@pytest.mark.parametrize("policy", [{}, {"GOMP_SPINCOUNT": "7"}, {"OMP_WAIT_POLICY": "active"}])
+def test_threads_wait_without_spinning_unless_the_user_says_how(policy):
+    import os
+
+    code = """if True:
+        import os, sys
+        from model.training.threads import wait_without_spinning
+        wait_without_spinning()
+        print(os.environ.get("OMP_WAIT_POLICY"), "torch" in sys.modules)"""
+    clean = {
+        name: value for name, value in os.environ.items() if name not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
+    }
+    output = subprocess.run([sys.executable, "-c", code], env=clean | policy, capture_output=True, text=True, check=True).stdout
+    assert output.split() == [policy.get("OMP_WAIT_POLICY", "None") if policy else "passive", "False"]
+
+
 def test_resolution_must_suit_the_model(shard, tmp_path):
     draft = FakeArtifact(tmp_path, [])
     draft.state = tmp_path / "state"
