@@ -179,8 +179,10 @@ def save(path: Path, value: Mesh | AtlasMesh) -> None:
     path.write_bytes(pack_arrays({name: np.asarray(array) for name, array in vars(value).items()}))
 
 
-def load_mesh(path: Path) -> Mesh:
-    return Mesh(**unpack_arrays(path.read_bytes()))
+def given_mesh(capture: Artifact) -> Mesh | None:
+    """The mesh that came with a capture, if one did."""
+    path = capture.path / "files" / "mesh.npz"
+    return Mesh(**unpack_arrays(path.read_bytes())) if path.exists() else None
 
 
 def load_atlas(path: Path) -> AtlasMesh:
