@@ -92,9 +92,8 @@ class Atlas(MapStage):
             parts.append(unfold.Tile(**{**arrays, "width": int(arrays["width"]), "height": int(arrays["height"])}))
         if not parts:
             raise UserError("no tile could be unfolded: see the rejects")
-        atlas = unfold.pack(parts, 2 * config.padding, config.size)
+        atlas = unfold.pack(parts, config.padding, config.size)
         save(draft.files / "atlas.npz", atlas)
-        texels = sum(part.width * part.height for part in parts)
         draft.note(
             "summary",
             {
@@ -103,7 +102,6 @@ class Atlas(MapStage):
                 "charts": int(atlas.charts.max()) + 1,
                 "width": atlas.width,
                 "height": atlas.height,
-                "tiles_share": round(texels / (atlas.width * atlas.height), 3),
             },
         )
 
@@ -116,7 +114,7 @@ def _densities(config: AtlasConfig, inputs: Inputs, mesh: Any, tiles: list[np.nd
 
     area = np.array([measure.face_areas(mesh.vertices, mesh.faces[rows]).sum() for rows in tiles])
     if config.size is not None:
-        fill = 0.6  # of the square; what does not fit is made smaller by ``pack``
+        fill = 0.65  # of the square; what does not fit is made smaller by ``pack``
         return [float(np.sqrt(fill * config.size**2 / area.sum()))] * len(tiles)
     if config.texels_per_metre is not None:
         densities = np.full(len(tiles), config.texels_per_metre / CaptureInfo.of(inputs["capture"]).metre)

@@ -132,7 +132,7 @@ def atlas():
     mesh = sphere(3)
     rows = unfold.tiles(mesh, 400)
     assert len(rows) == 4 and np.array_equal(np.sort(np.concatenate(rows)), np.arange(len(mesh.faces)))
-    return mesh, unfold.pack([unfold.unfold(mesh, r, 20.0, 2) for r in rows], 4)
+    return mesh, unfold.pack([unfold.unfold(mesh, r, 20.0, 2) for r in rows], 2)
 
 
 def test_an_atlas_is_the_same_surface(atlas):
@@ -164,14 +164,14 @@ def test_no_bilinear_footprint_leaves_its_chart(atlas):
 def test_a_fixed_size_is_kept_and_holds_all(atlas):
     mesh, _ = atlas
     parts = [unfold.unfold(mesh, rows, 60.0, 2) for rows in unfold.tiles(mesh, 400)]
-    flat = unfold.pack(parts, 4, size=256)
+    flat = unfold.pack(parts, 2, size=256)
     assert (flat.width, flat.height) == (256, 256) and flat.uvs.max() <= 1
 
 
 def test_tiles_do_not_overlap_in_the_texture(atlas):
     _, flat = atlas
     drawn = texels(flat)
-    assert 0.3 < (drawn.face >= 0).mean() < 1
+    assert 0.4 < (drawn.face >= 0).mean() < 1
     centre = np.einsum("fkd->fd", flat.uvs[flat.faces].astype(float)) / 3 * (flat.width, flat.height)
     column, row = np.floor(centre).astype(int).T
     same = drawn.face[row, column] == np.arange(len(flat.faces))

@@ -73,43 +73,39 @@ def unfold(mesh: Mesh, rows: np.ndarray, texels_per_unit: float, padding: int) -
     )
 
 
-def shelves(sizes: list[tuple[int, int]], width: int, gap: int) -> tuple[list[tuple[int, int]], int]:
-    """Places (x, y) of rectangles (w, h) on shelves of ``width``, tallest first, ``gap`` apart; and the height of all."""
-    places: list[tuple[int, int]] = [(0, 0)] * len(sizes)
-    x = y = shelf = 0
-    for index in sorted(range(len(sizes)), key=lambda i: (-sizes[i][1], -sizes[i][0], i)):
-        w, h = sizes[index]
-        if x and x + w > width:
-            x, y, shelf = 0, y + shelf + gap, 0
-        places[index] = (x, y)
-        x, shelf = x + w + gap, max(shelf, h)
-    return places, y + shelf
+def pack(parts: list[Tile], padding: int, size: int | None = None, multiple: int = 4) -> AtlasMesh:
+    """One texture of all charts of all tiles, each at its own size: about square, sides multiples of ``multiple``.
 
-
-def pack(parts: list[Tile], gap: int, size: int | None = None, multiple: int = 4) -> AtlasMesh:
-    """One texture of all tiles: about square, or ``size`` x ``size``; sides are multiples of ``multiple``.
-
-    Tiles that do not fit a given size are made smaller by one factor for all.
+    With ``size`` the texture is ``size`` x ``size``, and charts that do not fit are made smaller by one factor for all.
     """
-    sizes = [(part.width, part.height) for part in parts]
-    widest = max(w for w, _ in sizes)
-    area = sum(w * h for w, h in sizes)
-    guesses = [max(widest, int(np.sqrt(area) * factor)) for factor in np.linspace(0.9, 1.5, 25)]
-    packings = {width: shelves(sizes, width, gap) for width in guesses}
-    width = min(packings, key=lambda w: (max(w, packings[w][1]), w))
-    places, height = packings[width]
-    width = max(x + w for (x, _), (w, _) in zip(places, sizes, strict=True))
-    scale = 1.0 if size is None else min(1.0, size / max(width, height))
-    width, height = (size, size) if size else tuple(-(-side // multiple) * multiple for side in (width, height))
+    import xatlas
+
     first_vertex = np.cumsum([0, *(len(part.vertices) for part in parts)])
     first_chart = np.cumsum([0, *(int(part.charts.max(initial=-1)) + 1 for part in parts)])
+    left = np.cumsum([0, *(part.width + 16 for part in parts)])  # tiles side by side, so that no two charts touch
     order = np.argsort(np.concatenate([part.source for part in parts]), kind="stable")
-    uvs = np.concatenate([(part.uvs + place) * scale for part, place in zip(parts, places, strict=True)])
+    faces = np.concatenate([part.faces + first for part, first in zip(parts, first_vertex, strict=False)])[order]
+    charts = np.concatenate([part.charts + first for part, first in zip(parts, first_chart, strict=False)])[order]
+    spread = np.concatenate([part.uvs + (x, 0) for part, x in zip(parts, left, strict=False)]).astype(np.float32)
+
+    atlas = xatlas.Atlas()
+    atlas.add_uv_mesh(np.ascontiguousarray(spread), np.ascontiguousarray(faces, np.uint32))
+    options = xatlas.PackOptions()
+    options.texels_per_unit = 1.0
+    options.padding = int(padding)
+    options.bilinear = True
+    atlas.generate(pack_options=options)
+    copies, packed, uvs = atlas.get_mesh(0)
+    width, height = atlas.width, atlas.height
+    texels = np.asarray(uvs) * (width, height)
+    if size is not None:
+        texels *= min(1.0, size / max(width, height))
+    width, height = (size, size) if size else (-(-side // multiple) * multiple for side in (width, height))
     return AtlasMesh(
-        vertices=np.concatenate([part.vertices for part in parts]).astype(np.float32),
-        uvs=(uvs / (width, height)).astype(np.float32),
-        faces=np.concatenate([part.faces + v for part, v in zip(parts, first_vertex, strict=False)])[order].astype(np.int32),
-        charts=np.concatenate([part.charts + c for part, c in zip(parts, first_chart, strict=False)])[order].astype(np.int32),
+        vertices=np.concatenate([part.vertices for part in parts])[copies].astype(np.float32),
+        uvs=(texels / (width, height)).astype(np.float32),
+        faces=np.asarray(packed, np.int32).reshape(-1, 3),
+        charts=charts.astype(np.int32),
         width=int(width),
         height=int(height),
     )
