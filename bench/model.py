@@ -29,6 +29,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from model import timing  # noqa: E402
 from model.renderformer import layers, reference  # noqa: E402
 from model.renderformer.config import ModelConfig  # noqa: E402
 from model.renderformer.flops import TRAINING, forward_flops, ideal_seconds  # noqa: E402
@@ -52,17 +53,8 @@ def use_clock(name: str) -> None:
     clock = time.process_time if name == "cpu" else time.perf_counter
 
 
-def wait(device: str) -> None:
-    if device == "cuda":
-        torch.cuda.synchronize()
-
-
-def timed(function: Callable[[], Any], device: str) -> tuple[float, Any]:
-    wait(device)
-    began = clock()
-    result = function()
-    wait(device)
-    return clock() - began, result
+def timed(work: Callable[[], Any], device: str) -> tuple[float, Any]:
+    return timing.timed(work, device, clock)
 
 
 class Parts:
@@ -83,11 +75,11 @@ class Parts:
         layers.attend = self._attend
 
     def _enter(self, name: str) -> None:
-        wait(self.device)
+        timing.wait(self.device)
         self.stage, self.began = name, clock()
 
     def _leave(self, name: str) -> None:
-        wait(self.device)
+        timing.wait(self.device)
         self.seconds[name] += clock() - self.began
 
     def _attend(self, *arguments: Any) -> torch.Tensor:

@@ -53,6 +53,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.atomic import atomic_path
 from pipeline.keys import seed_for
 from pipeline.store import Artifact
 from stages.graphics import denoising
@@ -251,9 +252,8 @@ class Bench:
         path = self.arguments.work / "truth" / f"{digest.hexdigest()[:24]}.npz"
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = path.with_suffix(".tmp.npz")
-            np.savez(temporary, **make())
-            temporary.replace(path)
+            with atomic_path(path) as temporary:
+                np.savez(temporary, **make())
         with np.load(path) as file:
             return dict(file)
 
@@ -345,15 +345,16 @@ class BuiltIn:
     def __init__(self, scene: SceneRecord, resolution: int):
         import mitsuba as mi
 
+        from stages.graphics.geometry.measure import normal_vectors
         from stages.renderformer.rendering.scalar import perspective
-        from stages.renderformer.rendering.surfaces import face_normals, mesh_of, surface_mesh
+        from stages.renderformer.rendering.surfaces import mesh_of, surface_mesh
 
         surfaces, lights = np.nonzero(scene.light_index < 0)[0], scene.light_index >= 0
         shapes = {"surface": surface_mesh(scene, surfaces)}
         for radiance in np.unique(scene.emission[lights], axis=0):
             front = scene.triangles[lights & (scene.emission == radiance).all(axis=1)]
             for side in (front, front[:, ::-1]):
-                normal = face_normals(side)
+                normal = normal_vectors(side.astype(np.float64))
                 normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
                 ahead = scene.triangles[surfaces].reshape(-1, 3) @ normal.T > (normal * side[:, 0]).sum(axis=1)
                 shine = {"type": "rgb", "value": radiance.tolist()}

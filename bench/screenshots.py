@@ -22,7 +22,11 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 def sections(page: str) -> dict[str, str]:
     """Id of a section -> the page with its head and this section alone; ``top`` is what comes before the first one."""
     head, body = page.split("<body>")
-    starts = [("top", 0), *((match[1], match.start()) for match in re.finditer(r'<h2 id="([^"]+)"', body)), ("", len(body))]
+    starts = [
+        ("top", 0),
+        *((match[1], match.start()) for match in re.finditer(r'<section id="([^"]+)"', body)),
+        ("", len(body)),
+    ]
     return {
         name: f"{head}<body>{body[start:end]}</body></html>"
         for (name, start), (_, end) in zip(starts, starts[1:], strict=False)

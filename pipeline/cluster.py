@@ -29,6 +29,7 @@ from pipeline.config import Limits, Section, StageConfig, nearest
 from pipeline.errors import MachineError, UserError
 from pipeline.executor import PoolBroken, open_pool, run_on
 from pipeline.stage import load_system
+from pipeline.store import FINISHED
 from pipeline.worker import PartResult, PartTask, running_file
 
 # known names -> (module, class): a config chooses one of these, never an import path
@@ -274,7 +275,7 @@ class Cluster:
                         trace = (
                             f"its part was lost with {error.last_worker.address} and others before: look at the workers' logs"
                         )
-                        result, lines = PartResult(task.part_key, 0, failed=tuple((item.id, trace) for item in task.items)), []
+                        result, lines = PartResult(task.part_key, failed=tuple((item.id, trace) for item in task.items)), []
                     for line in lines:
                         log(line)
                     if isinstance(result, UserError):
@@ -306,7 +307,7 @@ class Cluster:
 
 def _wait_until_visible(task: PartTask) -> None:
     """A network file system may hide for a while what another machine has just written."""
-    marker = task.draft / "markers" / f"{task.part_key}.json"
+    marker = task.draft / FINISHED / f"{task.part_key}.json"
     until = time.monotonic() + VISIBLE_S
     while not marker.exists():
         if time.monotonic() > until:

@@ -19,6 +19,9 @@ from pipeline.progress import duration
 from pipeline.repair import repair
 from pipeline.status import lines, read_states
 from pipeline.store import Artifact, Store, iter_inputs
+from pipeline.terminal import console, print_table
+
+STATE_STYLES = {"running": "green", "stopped": "yellow", "dead": "red"}
 
 
 def size(count: float) -> str:
@@ -63,19 +66,13 @@ def _places(store: Store, reference: str | None) -> list[str | None]:
 def command_ls(store: Store, arguments: argparse.Namespace) -> int:
     places = _places(store, arguments.stage)
     artifacts = [artifact for where in places for artifact in store.artifacts(where)]
-    for artifact in artifacts:
-        outputs = artifact.manifest["outputs"]
-        age = duration(time.time() - artifact.manifest["finished"])
-        pin = "pinned" if store.pinned(artifact.key) else ""
-        rejects = sum(outputs["rejects"].values())
-        name = artifact.name
-        print(f"{name:<44} {outputs['records']:>7} records {rejects:>5} rejected {size(outputs['bytes']):>8}  {age} ago  {pin}")
+    print_table((_list_row(store, artifact) for artifact in artifacts), right=(1, 2, 3))
     for path in store.drafts():
         where = store.place_of(path)
         if None in places or where in places:
             holder = store.claim(where, path.name.removesuffix(".partial")).holder()
             state = f"in the making by process {holder['pid']} on {holder['host']}" if holder else "unfinished"
-            parts = len(list((path / "markers").glob("*.json")))
+            parts = len(list((path / "markers").glob("[!.]*.json")))
             print(f"{where}/{path.name[:12]}.partial  {parts} parts, {state}")
     readable = {artifact.path for artifact in artifacts}
     for path in (path for where in places for path in store.folders(where)):
@@ -85,6 +82,14 @@ def command_ls(store: Store, arguments: argparse.Namespace) -> int:
     if not artifacts:
         print(f"no artifacts in {store.root}")
     return 0
+
+
+def _list_row(store: Store, artifact: Artifact) -> tuple[str, ...]:
+    outputs = artifact.manifest["outputs"]
+    age = duration(time.time() - artifact.manifest["finished"])
+    rejects = sum(outputs["rejects"].values())
+    pin = "pinned" if store.pinned(artifact.key) else ""
+    return artifact.name, f"{outputs['records']} records", f"{rejects} rejected", size(outputs["bytes"]), f"{age} ago", pin
 
 
 def command_show(store: Store, arguments: argparse.Namespace) -> int:
@@ -155,7 +160,10 @@ def _lineage(store: Store, artifact: Artifact, indent: str, seen: set[str]) -> N
 
 
 def command_why(store: Store, arguments: argparse.Namespace) -> int:
-    """Two artifacts: what differs. A stage and overrides: why it would be computed, against the nearest artifact."""
+    """Two artifacts: what differs. A stage and overrides: why it would be computed, against the nearest artifact.
+
+    The stage is written as for the other commands: ``STAGE``, or ``SYSTEM/STAGE``.
+    """
     first, *rest = arguments.words
     if len(rest) == 1 and "=" not in rest[0]:
         old, new = store.resolve(first), store.resolve(rest[0])
@@ -163,7 +171,7 @@ def command_why(store: Store, arguments: argparse.Namespace) -> int:
             raise UserError(f"{first} is of stage {old.stage}, {rest[0]} of {new.stage}: only like can be compared")
         _explain(store, old.manifest["preimage"], new.manifest["preimage"], "", lambda key: _preimage(store, key))
         return 0
-    run, system, sections = split_config(compose([f"stage={first}", *rest]))
+    run, system, sections = split_config(compose([*_choice_of_stage(store, first), *rest]))
     with hashes_of(store) as hashes:
         plan = make_plan(run, system, sections, hashes)
     by_key = {planned.key: planned.preimage for planned in plan.values()}
@@ -187,6 +195,19 @@ def command_why(store: Store, arguments: argparse.Namespace) -> int:
             lambda key: by_key.get(key) or _preimage(store, key),
         )
     return 0
+
+
+def _choice_of_stage(store: Store, reference: str) -> list[str]:
+    """The overrides that choose ``STAGE`` or ``SYSTEM/STAGE``.
+
+    Artifacts of that name know the module of their system, which may have a longer name. Without any, SYSTEM is the module.
+    """
+    system, _, stage = reference.rpartition("/")
+    places = [place for place in store.places(reference) if place.rpartition("/")[2] == stage]
+    modules = {artifact.manifest["system"] for place in places for artifact in store.artifacts(place)[-1:]}
+    if len(modules) == 1:
+        system = modules.pop()
+    return [f"stage={stage}", *([f"system={system}"] if system else [])]
 
 
 def _preimage(store: Store, key: str) -> Mapping[str, Any] | None:
@@ -221,8 +242,11 @@ def command_status(store: Store, arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(states, indent=1))
         return 0
+    out = console()
     for state in states:
-        print("\n".join(lines(state)))
+        head, *rest = lines(state)
+        out.print(head, style=STATE_STYLES[state["state"]])
+        out.print("\n".join(rest))
     if not states:
         print(f"nothing is running or unfinished in {store.root}")
     return 0
@@ -307,7 +331,7 @@ def add_commands(parsers: Any, program: str) -> None:
     parser.add_argument("artifact", help="a key or its beginning, stage/folder, or a stage's name for its newest")
     parser.add_argument("--rejects", type=int, default=10, help="how many rejects to list (default: 10)")
     parser = add("why", command_why, "say which parameter makes a stage run again", "render render.max_spp=64")
-    parser.add_argument("words", nargs="+", help="a stage and config overrides, or two artifacts to compare")
+    parser.add_argument("words", nargs="+", help="STAGE or SYSTEM/STAGE and config overrides, or two artifacts to compare")
     parser = add("verify", command_verify, "check artifacts against their manifests", "--deep")
     parser.add_argument("artifacts", nargs="*", help="which (default: all)")
     parser.add_argument("--deep", action="store_true", help="read and hash every byte")

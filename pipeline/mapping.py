@@ -82,24 +82,22 @@ def run_map(
         markers, damaged = draft.sound_markers(
             {key: [item.id for item in part_items] for key, (_, part_items, _) in parts.items()}
         )
+        unfinished = draft.unfinished_parts()
         limits = Limits(**{**stage.limits, **config.limits.model_dump(exclude_none=True)})
         tasks: list[PartTask] = []
         fresh: dict[str, int] = {}  # part key -> items to compute
         total, again = len(items), 0
         for part_key, (group, part_items, part_item_keys) in parts.items():
-            marker = markers[part_key]
-            allowed = {reject["item"] for reject in marker["rejects"] if limits.exceed(reject)} if marker is not None else set()
-            if marker is not None and not allowed:
+            marker = markers[part_key] or unfinished.get(part_key, {"items": [], "rejects": []})
+            allowed = {reject["item"] for reject in marker["rejects"] if limits.exceed(reject)}
+            kept = set(marker["items"]) - allowed
+            if len(kept) == len(part_items) and markers[part_key] is not None:
                 state.add_rejects(Counter(reject["reason"] for reject in marker["rejects"]))
                 continue
             again += len(allowed)
             wanted = zip(part_items, part_item_keys, strict=True)
-            reuse = {
-                item.id: donors[item_key]
-                for item, item_key in wanted
-                if item_key in donors and (not allowed or item.id in allowed)
-            }
-            fresh[part_key] = len(allowed or part_items) - len(reuse)
+            reuse = {item.id: donors[item_key] for item, item_key in wanted if item_key in donors and item.id not in kept}
+            fresh[part_key] = len(part_items) - len(kept) - len(reuse)
             tasks.append(
                 PartTask(
                     run.system, planned.name, planned.key, config, inputs, environment, draft.path,
@@ -108,7 +106,7 @@ def run_map(
             )  # fmt: skip
     part_keys = list(parts)
     # There may be millions, and workers and what follows need the room; what is to be made is in the tasks.
-    del items, keys, donors, parts, markers
+    del items, keys, donors, parts, markers, unfinished
     reused = total - sum(fresh.values())
     if not forced:
         sources: dict[Path, _Source] = {}
@@ -128,7 +126,7 @@ def run_map(
         for item, trace in result.failed:
             failed.append((item, trace, log))
             state.add_failure(item, trace, log)
-        progress.add(fresh[result.part_key] if not result.failed else 0, sum(result.rejects.values()))
+        progress.add(max(0, fresh[result.part_key] - len(result.failed)), sum(result.rejects.values()))
         state.add_rejects(result.rejects)
         state.update(now=bool(result.failed), done=progress.done)
 

@@ -6,9 +6,13 @@ import sys
 import time
 from typing import TextIO
 
+from rich.progress import BarColumn, TextColumn
+from rich.progress import Progress as Bars
+
+from pipeline.terminal import console
+
 PLAIN_EVERY_S = 10.0
 BAR_EVERY_S = 0.2
-BAR_WIDTH = 24
 
 
 def duration(seconds: float) -> str:
@@ -21,18 +25,24 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """Progress of one stage on ``stream``. ``reused`` items count as done but not towards the rate."""
+    """Progress of one stage on ``stream``. ``reused`` items count as done but not towards the rate.
+
+    The bar is drawn by ``add`` and not by a thread of rich's own, because workers may be forked from this process.
+    """
 
     def __init__(self, label: str, total: int, reused: int = 0, stream: TextIO | None = None):
-        self.label = label
-        self.total = total
-        self.reused = reused
-        self.done = reused
-        self.rejects = 0
-        self._stream = stream or sys.stdout
-        self._start = time.monotonic()
-        self._terminal = self._stream.isatty()
-        self._last = self._start if not self._terminal else 0.0
+        self.label, self.total, self.reused = label, total, reused
+        self.done, self.rejects = reused, 0
+        self._start = self._last = time.monotonic()
+        self._console = console(stream or sys.stdout)
+        self._terminal = self._console.is_terminal
+        self._bars = Bars(
+            TextColumn("{task.description}", markup=False), BarColumn(24),
+            console=self._console, auto_refresh=False, transient=True, redirect_stdout=False, redirect_stderr=False,
+        )  # fmt: skip
+        self._bar = self._bars.add_task(label, total=max(total, 1), completed=reused)
+        if self._terminal:
+            self._bars.start()
 
     def line(self) -> str:
         elapsed = time.monotonic() - self._start
@@ -45,22 +55,19 @@ class Progress:
         self.done += done
         self.rejects += rejects
         now = time.monotonic()
-        if self._terminal and now - self._last > BAR_EVERY_S:
-            filled = round(BAR_WIDTH * self.done / max(self.total, 1))
-            self._stream.write(f"\r\033[K{self.line()} [{'#' * filled}{'.' * (BAR_WIDTH - filled)}]")
-            self._stream.flush()
-            self._last = now
-        elif not self._terminal and now - self._last > PLAIN_EVERY_S and self.done < self.total:
-            print(self.line(), file=self._stream, flush=True)
-            self._last = now
+        if now - self._last <= (BAR_EVERY_S if self._terminal else PLAIN_EVERY_S):
+            return
+        self._last = now
+        if self._terminal:
+            self._bars.update(self._bar, completed=self.done, description=self.line(), refresh=True)
+        elif self.done < self.total:
+            self.log(self.line())
 
     def log(self, text: str) -> None:
         """A line of its own, above the bar."""
-        if self._terminal:
-            self._stream.write("\r\033[K")
-        print(text, file=self._stream, flush=True)
+        self._console.print(text)
 
     def close(self) -> None:
+        """Take the bar away."""
         if self._terminal:
-            self._stream.write("\r\033[K")
-            self._stream.flush()
+            self._bars.stop()

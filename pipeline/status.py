@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.atomic import atomic_path
 from pipeline.progress import duration
 from pipeline.store import Store
 
@@ -42,10 +43,8 @@ class RunState:
         if not now and elapsed - self._written < WRITE_EVERY_S:
             return
         self._written = elapsed
-        temporary = self._path.with_suffix(f".{os.getpid()}")
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError), atomic_path(self._path, durable=False) as temporary:
             temporary.write_text(json.dumps({**self._facts, "seconds": round(elapsed, 3)}))
-            os.replace(temporary, self._path)
 
     def add_rejects(self, rejects: Mapping[str, int]) -> None:
         counts = self._facts["rejects"]
@@ -79,7 +78,7 @@ def read_states(store: Store, place: str | None = None) -> list[dict[str, Any]]:
         marked = list((path / "markers").glob("[!.]*.json"))
         items = []
         if holder:
-            for file in sorted((path / "running").glob("*.json")):
+            for file in sorted((path / "running").glob("[!.]*.json")):
                 item = _read(file)
                 if "item" in item:
                     seconds = round(time.time() - item["time"], 1)

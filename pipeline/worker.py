@@ -18,17 +18,17 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from pipeline.atomic import atomic_path
 from pipeline.config import Limits
 from pipeline.errors import STORAGE_ERRORS, Damaged, Reject, UserError
 from pipeline.stage import Item, MapStage, Record, load_system
-from pipeline.store import Artifact, Draft
-from pipeline.store.listing import Row
+from pipeline.store import FINISHED, UNFINISHED, Artifact, Draft, Row
 
 THREADS_VARIABLE = "LIGHTMILL_THREADS"  # what a stage may use in a worker; also set as OMP_NUM_THREADS and its like
 _opened: dict[tuple[str, str], tuple[MapStage, Any]] = {}  # (stage, key) -> the stage and its worker, once per process
@@ -76,7 +76,6 @@ class PartResult:
     """What the runner hears of a part: rejects by reason; ``failed`` holds (item id, traceback) of ordinary exceptions."""
 
     part_key: str
-    done: int
     rejects: Mapping[str, int] = field(default_factory=dict)
     failed: tuple[tuple[str, str], ...] = ()
 
@@ -137,16 +136,16 @@ def _output_to(path: Path) -> Iterator[None]:
 def _announce(task: PartTask, item: str | None) -> None:
     """Say what this process is at: an item, or None while it opens what its items need."""
     times = os.times()
-    path = running_file(task.draft, task.part_key)
-    temporary = path.with_suffix(f".{os.getpid()}")
     # ``time`` is for people; limits go by ``monotonic``, which no change of the clock moves
     state = {"pid": os.getpid(), "item": item, "cpu_s": times.user + times.system}
-    temporary.write_text(json.dumps({**state, "time": time.time(), "monotonic": time.monotonic()}))
-    os.replace(temporary, path)
+    with atomic_path(running_file(task.draft, task.part_key), durable=False) as temporary:
+        temporary.write_text(json.dumps({**state, "time": time.time(), "monotonic": time.monotonic()}))
 
 
 def run_part(task: PartTask, log: bool = True) -> PartResult:
-    """Make the part: write its tar and its marker into the draft. An exception in an item fails the part.
+    """Make the part: write its tar and its marker into the draft.
+
+    An exception in an item leaves the part unfinished. The draft keeps its other items for the next run.
 
     ``log``: what this process prints meanwhile goes to the part's log.
     """
@@ -200,10 +199,10 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
             raise AssertionError(f"{task.stage} made no record of item {item.id!r} and did not reject it")
         return records
 
-    def taken_over(reuse: Reuse, item: Item) -> list[Record] | Reject:
+    def taken_over(read: Callable[[], list[Record]], item: Item) -> list[Record] | Reject:
         try:
-            return [_artifact(reuse.artifact).read(record) for record in reuse.records]
-        except Damaged as error:  # of an artifact that this one does not depend on
+            return read()
+        except Damaged as error:  # of an artifact that this one does not depend on, or of an unfinished part
             say(f"{item.id}: not taken over: {error}")
             return compute(item)
 
@@ -212,13 +211,15 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
         reuse = task.reuse.get(item.id)
         try:
             if item.id in kept:
-                result: list[Record] | Reject | _Failure = [draft.read_row(row) for row in kept[item.id]]
+                result: list[Record] | Reject | _Failure = taken_over(
+                    lambda: [draft.read_row(row) for row in kept[item.id]], item
+                )
             elif reuse is None:
                 result = compute(item)
             elif reuse.reject is not None:
                 result = Reject(reuse.reject["reason"], reuse.reject["detail"])
             else:
-                result = taken_over(reuse, item)
+                result = taken_over(lambda: [_artifact(reuse.artifact).read(record) for record in reuse.records], item)
         except UserError:
             raise
         except Exception as error:
@@ -238,13 +239,15 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
     finished = draft.sound_markers({task.part_key: [item.id for item in task.items]})[0][task.part_key]
     if finished is not None and not any(task.limits.exceed(reject) for reject in finished["rejects"]):
         say("finished already, by a worker that died before it could say so")
-        return PartResult(task.part_key, len(task.items), Counter(reject["reason"] for reject in finished["rejects"]))
+        return PartResult(task.part_key, Counter(reject["reason"] for reject in finished["rejects"]))
     kept: dict[str, list[Row]] = {}
     rejected = dict(task.killed)
-    if finished is not None:  # under lower limits: what they rejected is tried again, the rest stays as it is
-        for row in map(Row.from_json, (draft.marker(task.part_key) or {"rows": []})["rows"]):
+    # a part finished under lower limits, or one of which an item failed: what they lack is computed, the rest stays as it is
+    before = draft.marker(task.part_key, UNFINISHED if finished is None else FINISHED)
+    if before is not None:
+        for row in map(Row.from_json, before["rows"]):
             kept.setdefault(row.item, []).append(row)
-        rejected = {reject["item"]: reject for reject in finished["rejects"] if not task.limits.exceed(reject)} | rejected
+        rejected = {reject["item"]: reject for reject in before["rejects"] if not task.limits.exceed(reject)} | rejected
     writer = draft.open_part()
     rejects: list[dict[str, Any]] = []
     failed: list[tuple[str, str]] = []
@@ -263,19 +266,23 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
             else:
                 for record in result:
                     writer.add(record, item.id, item.group, item_key)
-        if failed:
-            writer.discard()
-            return PartResult(task.part_key, 0, failed=tuple(failed))
+        failed_items = {item for item, _ in failed}
         marker = {
             **writer.close(),
             "part_key": task.part_key,
             "group": task.group,
-            "items": [item.id for item in task.items],
+            "items": [item.id for item in task.items if item.id not in failed_items],
             "rejects": rejects,
         }
-        draft.finish_part(task.part_key, marker)
-        say(f"finished: {len(marker['rows'])} records, {len(rejects)} rejects, {marker['bytes']} bytes")
-        return PartResult(task.part_key, len(task.items), Counter(reject["reason"] for reject in rejects))
+        if not failed:
+            draft.finish_part(task.part_key, marker)
+        elif marker["items"]:
+            draft.keep_unfinished(task.part_key, marker)
+        say(
+            f"{f'unfinished, {len(failed)} failed' if failed else 'finished'}: "
+            f"{len(marker['rows'])} records, {len(rejects)} rejects, {marker['bytes']} bytes"
+        )
+        return PartResult(task.part_key, Counter(reject["reason"] for reject in rejects), tuple(failed))
     except BaseException:
         writer.discard()
         raise

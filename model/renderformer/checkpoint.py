@@ -15,9 +15,9 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from model.errors import InputError
-from model.files import replace
 from model.renderformer.config import ModelConfig
 from model.renderformer.network import RenderFormer
+from pipeline.atomic import atomic_path, write_atomic
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 
@@ -29,13 +29,10 @@ def save(
     folder.mkdir(parents=True, exist_ok=True)
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
     metadata = {"format": "pt", **(trained_with or {})}
-    temporary = folder / (WEIGHTS + ".tmp")
-    save_file(state, temporary, metadata)
-    _sort_metadata(temporary)
-    replace(temporary, folder / WEIGHTS)
-    temporary = folder / (CONFIG + ".tmp")
-    temporary.write_text(config.dumps())
-    replace(temporary, folder / CONFIG)
+    with atomic_path(folder / WEIGHTS) as temporary:
+        save_file(state, temporary, metadata)
+        _sort_metadata(temporary)
+    write_atomic(folder / CONFIG, config.dumps().encode())
 
 
 def _sort_metadata(path: Path) -> None:

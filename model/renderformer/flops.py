@@ -7,12 +7,12 @@ hundredth. A training step counts as three forward passes, recomputation not inc
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Mapping, Sequence
 
 import torch
 
 from model.renderformer.config import ModelConfig
+from model.timing import fastest
 
 TRAINING = 3  # forward passes' worth of a training step: forward, gradients of activations, gradients of weights
 ENCODER_PARTS = ("embedding", "encoder layers", "encoder attention")  # the rest is of the view-dependent stage
@@ -83,16 +83,4 @@ def peak_flops(device: str, dtype: str, size: int = 0) -> float:
     size = size or (8192 if device.startswith("cuda") else 1024)
     random = torch.Generator(device).manual_seed(0)  # its own: a run's random numbers stay what they were
     a, b = (torch.randn(size, size, device=device, generator=random).to(getattr(torch, dtype)) for _ in range(2))
-    best = float("inf")
-    for _ in range(8):
-        _wait(device)
-        began = time.perf_counter()
-        torch.mm(a, b)
-        _wait(device)
-        best = min(best, time.perf_counter() - began)
-    return 2 * size**3 / best
-
-
-def _wait(device: str) -> None:
-    if device.startswith("cuda"):
-        torch.cuda.synchronize(device)
+    return 2 * size**3 / fastest(lambda: torch.mm(a, b), device, repeats=8)

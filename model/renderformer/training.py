@@ -23,7 +23,6 @@ import torch
 from torch import Tensor, nn
 
 from model.errors import InputError
-from model.files import replace
 from model.lpips import LPIPS
 from model.renderformer import checkpoint
 from model.renderformer.flops import TRAINING, forward_flops, ideal_seconds, peak_flops
@@ -32,6 +31,7 @@ from model.renderformer.network import RenderFormer, to_radiance
 from model.training.logs import TrainingLog
 from model.training.optimization import Average, optimizers, schedule, set_learning_rate
 from model.training.parallel import Group, accumulating, distribute, gather, scatter
+from pipeline.atomic import atomic_path
 
 STATE, LAST, BEST = "training.pt", "last", "best"
 PATIENCE = 20  # this many non-finite steps in a row stop the run
@@ -206,9 +206,8 @@ class _State:
         if torch.cuda.is_available():
             whole["rng"]["cuda"] = torch.cuda.get_rng_state()
         if self.group.leads:
-            temporary = self.path.with_suffix(".tmp")
-            torch.save(whole, temporary)
-            replace(temporary, self.path)
+            with atomic_path(self.path) as temporary:
+                torch.save(whole, temporary)
 
     def load(self) -> bool:
         """Whether there was something to go on from."""

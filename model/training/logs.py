@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from model.files import replace
+from pipeline.atomic import write_atomic
 
 LOG = "log.jsonl"
 
@@ -27,9 +27,7 @@ def cut(path: Path, step: int) -> None:
             break
         if row["step"] <= step:
             kept.append(line + "\n")
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text("".join(kept))
-    replace(temporary, path)
+    write_atomic(path, "".join(kept).encode())
 
 
 class TrainingLog:

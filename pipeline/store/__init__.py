@@ -3,7 +3,8 @@
 ::
 
     store/render/<slug>-<12 hex of the key>/manifest.json items.jsonl rejects.jsonl parts/<digest>.tar files/ logs/
-    store/render/<key>.partial/      the same in the making, with markers/ (finished parts) and state/ (run stages)
+    store/render/<key>.partial/      the same in the making, with markers/ (finished parts), unfinished/ (parts of which
+                                     an item failed) and state/ (run stages)
 
 A committed artifact is never changed in place. Parts are written to a temporary name, flushed and renamed to their digest;
 a marker then says that the part is finished. Killing a process anywhere leaves a complete artifact or a draft that the next
@@ -12,15 +13,15 @@ run continues.
 
 from pipeline.store.artifact import DRAFT, SCHEMA, Artifact, is_sound, place, read_draft
 from pipeline.store.claim import Claim
-from pipeline.store.draft import UNKNOWN, Draft, PartWriter
+from pipeline.store.draft import FINISHED, UNFINISHED, UNKNOWN, Draft, PartWriter
 from pipeline.store.folder import Store, history, iter_inputs, store_of
 from pipeline.store.hashes import HashCache
 from pipeline.store.listing import Listing, Row
 from pipeline.store.record import RECORD_ID, Record, record_digest
 
 __all__ = [
-    "DRAFT", "RECORD_ID",
-    "SCHEMA", "UNKNOWN", "Artifact", "Claim", "Draft", "HashCache", "Listing", "PartWriter", "Record", "Row",
+    "DRAFT", "FINISHED", "RECORD_ID",
+    "SCHEMA", "UNFINISHED", "UNKNOWN", "Artifact", "Claim", "Draft", "HashCache", "Listing", "PartWriter", "Record", "Row",
     "Store", "history", "is_sound",
     "place", "iter_inputs", "read_draft", "record_digest", "store_of",
 ]  # fmt: skip

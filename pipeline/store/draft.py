@@ -1,6 +1,8 @@
 """An artifact in the making. Everything in it survives a kill.
 
 Parts are written to a temporary name, flushed and renamed to their digest; a marker then says that the part is finished.
+A part of which an item failed holds its other items, in a tar of the same kind. Its marker lies in a folder of its own,
+so that nobody takes the part for a finished one.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from pipeline.atomic import TEMPORARY, publish, sync, write_atomic
 from pipeline.errors import UserError
 from pipeline.keys import digest_of
 from pipeline.store.artifact import DRAFT, Records, is_sound, read_draft
@@ -22,8 +25,6 @@ from pipeline.store.files import (
     hash_file,
     json_line,
     read_sealed,
-    sync,
-    write_atomic,
     write_jsonl,
     write_sealed,
 )
@@ -31,7 +32,8 @@ from pipeline.store.listing import Listing, Row
 from pipeline.store.record import Record, record_digest
 
 UNKNOWN = "unknown"  # the digest of code that nobody noted
-WORKING = ("markers", "running", "state")  # folders of a draft that its artifact does not keep
+FINISHED, UNFINISHED = "markers", "unfinished"  # folders of parts' markers
+WORKING = (FINISHED, UNFINISHED, "running", "state")  # folders of a draft that its artifact does not keep
 
 
 class Draft(Records):
@@ -45,7 +47,7 @@ class Draft(Records):
         self.summary: dict[str, Any] = {}
         self._out = out
         self._whole_rejects: list[dict[str, Any]] = []
-        for folder in ("parts", "markers", "files", "state", "logs", "running"):
+        for folder in ("parts", "files", "logs", *WORKING):
             (path / folder).mkdir(parents=True, exist_ok=True)
 
     files = property(lambda self: self.path / "files")
@@ -67,7 +69,8 @@ class Draft(Records):
 
     def sweep(self) -> None:
         """Delete what workers that were killed left half written. Only for who holds the claim."""
-        for pattern in ("parts/.*.tmp", "markers/.*.tmp", ".*.tmp", "running/*.json"):
+        folders = ("", "parts/", f"{FINISHED}/", f"{UNFINISHED}/", "files/**/", "state/**/")
+        for pattern in ("running/*.json", *(folder + TEMPORARY for folder in folders)):
             for path in self.path.glob(pattern):
                 path.unlink(missing_ok=True)
 
@@ -98,9 +101,12 @@ class Draft(Records):
 
     # -- parts
 
-    def marker(self, part_key: str) -> dict[str, Any] | None:
-        """The finished part of that key, or None; a marker whose file is missing or cut does not count."""
-        path = self.path / "markers" / f"{part_key}.json"
+    def marker_path(self, part_key: str, folder: str = FINISHED) -> Path:
+        return self.path / folder / f"{part_key}.json"
+
+    def marker(self, part_key: str, folder: str = FINISHED) -> dict[str, Any] | None:
+        """The part of that key, finished or ``UNFINISHED``, or None. A marker whose file is missing or cut does not count."""
+        path = self.marker_path(part_key, folder)
         try:
             marker = read_sealed(path)
             if marker["digest"] is not None and self.part_path(marker["digest"]).stat().st_size != marker["bytes"]:
@@ -130,8 +136,35 @@ class Draft(Records):
             found = dict(zip(parts, threads.map(check, parts), strict=True))
         return {key: marker for key, (marker, _) in found.items()}, sum(damaged for _, damaged in found.values())
 
+    def unfinished_parts(self) -> dict[str, dict[str, Any]]:
+        """Part key -> marker (less its rows) of each part of which an item failed; ``items`` are those that are done.
+
+        Every byte is read, as by ``sound_markers``. A damaged part is left out.
+        """
+        markers = {path.stem: self.marker(path.stem, UNFINISHED) for path in (self.path / UNFINISHED).glob("[!.]*.json")}
+        return {
+            part_key: {name: value for name, value in marker.items() if name != "rows"}
+            for part_key, marker in markers.items()
+            if marker is not None and (marker["digest"] is None or is_sound(self.part_path(marker["digest"]), marker["digest"]))
+        }
+
     def finish_part(self, part_key: str, marker: Mapping[str, Any]) -> None:
-        write_sealed(self.path / "markers" / f"{part_key}.json", marker)
+        """Say that the part is finished. What was kept of it while it was not goes."""
+        kept = self.marker(part_key, UNFINISHED)
+        write_sealed(self.marker_path(part_key), marker)
+        self.marker_path(part_key, UNFINISHED).unlink(missing_ok=True)
+        self._drop_tar(kept, marker)
+
+    def keep_unfinished(self, part_key: str, marker: Mapping[str, Any]) -> None:
+        """Keep the items that are done of a part of which an item failed, instead of what was kept before."""
+        kept = self.marker(part_key, UNFINISHED)
+        write_sealed(self.marker_path(part_key, UNFINISHED), marker)
+        self._drop_tar(kept, marker)
+
+    def _drop_tar(self, old: Mapping[str, Any] | None, new: Mapping[str, Any]) -> None:
+        """Delete the tar of a marker that is replaced. If the new marker names the same one, it stays."""
+        if old is not None and old["digest"] not in (None, new["digest"]):
+            self.part_path(old["digest"]).unlink(missing_ok=True)
 
     def open_part(self) -> PartWriter:
         return PartWriter(self)
@@ -151,8 +184,7 @@ class Draft(Records):
                     os.link(source, temporary)
                 except OSError:
                     shutil.copyfile(source, temporary)
-                    sync(temporary)
-                os.replace(temporary, target)
+                publish(temporary, target)
         self.finish_part(part_key, marker)
         return True
 
@@ -248,11 +280,8 @@ class PartWriter:
         if not self._rows:
             self.discard()
             return {"digest": None, "bytes": 0, "rows": []}
-        self._file.flush()
-        os.fsync(self._file.fileno())
         self._file.close()
-        os.replace(self._path, self._draft.part_path(digest))
-        sync(self._path.parent)
+        publish(self._path, self._draft.part_path(digest))
         for row in self._rows:
             row["part"] = digest
         return {"digest": digest, "bytes": self._tar.size, "rows": self._rows}

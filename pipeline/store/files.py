@@ -1,42 +1,16 @@
-"""Durable file operations, JSON that notices damage, and the deterministic tar that parts are made of."""
+"""JSON that notices damage, and the deterministic tar that parts are made of."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import tarfile
-import uuid
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from pipeline.atomic import write_atomic
 from pipeline.keys import blake
-
-
-def sync(path: Path) -> None:
-    """Make the bytes of a file, or the renames and new names in a folder, survive a power cut."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def write_atomic(path: Path, data: bytes | Iterable[bytes]) -> None:
-    """Write ``data``, whole or in pieces, to a temporary name, flush it to disk, rename: readers see all of it or none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            file.writelines([data] if isinstance(data, bytes) else data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync(path.parent)
 
 
 def _json(value: Any) -> bytes:

@@ -11,13 +11,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pipeline.atomic import sync, write_atomic
 from pipeline.errors import Damaged, MachineError, UserError
 from pipeline.store.artifact import DRAFT, Artifact, read_draft
 from pipeline.store.claim import Claim
-from pipeline.store.draft import UNKNOWN, WORKING, Draft
+from pipeline.store.draft import FINISHED, UNFINISHED, UNKNOWN, WORKING, Draft
 from pipeline.store.files import (
-    sync,
-    write_atomic,
     write_sealed,
 )
 
@@ -139,7 +138,7 @@ class Store:
         """
         path = self.draft_path(place, key)
         before = read_draft(path)
-        begun = any(any((path / folder).glob("[!.]*")) for folder in ("markers", "state"))
+        begun = any(any((path / folder).glob("[!.]*")) for folder in (FINISHED, UNFINISHED, "state"))
         if begun and purpose == "force" and (before or {}).get("purpose") != "force":
             aside = self.trash(path)
             out(f"   note: force takes nothing of what an earlier run had finished; that is in {aside} until gc deletes it")
@@ -201,9 +200,6 @@ class Store:
             path.touch()
         except OSError:
             pass  # a read-only store can still be read
-
-    def last_used(self, artifact: Artifact) -> float:
-        return self._used(artifact.key, artifact.manifest["finished"])
 
     def _used(self, key: str, made: float) -> float:
         path = self.root / ".used" / key
@@ -326,7 +322,7 @@ class _Node(NamedTuple):
 
 def _changed_since(draft: Path, moment: float) -> bool:
     """Whether anything was written in the draft since then: a part's marker, a log, a checkpoint, a file, the run's state."""
-    for folder in ("running", "state", "markers", "logs", "files"):
+    for folder in (*WORKING, "logs", "files"):
         for where, _, names in os.walk(draft / folder):
             for name in ("", *names):
                 with contextlib.suppress(FileNotFoundError):

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.atomic import atomic_path
 from pipeline.errors import UserError
 from stages.graphics.arrays import unpack_json
 
@@ -140,10 +141,10 @@ def decode_rgb(data: bytes, where: str = "the image") -> np.ndarray:
 
 def write_rgb(path: Path, image: np.ndarray) -> None:
     """``image`` (H, W, 3), linear RGB, as a float32 EXR file; the file appears whole or not at all."""
-    temporary = path.with_name(path.name + ".tmp")
+    data = encode_rgb(image, np.float32)
     try:
-        temporary.write_bytes(encode_rgb(image, np.float32))
-        temporary.replace(path)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(data)
     except OSError as error:
         raise UserError(f"{path} cannot be written ({error.strerror}): give a file in an existing folder") from error
 

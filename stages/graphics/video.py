@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.atomic import atomic_path
 from pipeline.errors import UserError
 
 QUALITY = "16"  # x264's constant rate factor: differences are not seen
@@ -21,10 +22,10 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = 24) -> int:
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
-    temporary = path.with_name(path.name + ".tmp")
     count = 0
     try:
-        with av.open(str(temporary), "w", format="mp4", options={"movflags": "faststart"}) as file:
+        options = {"movflags": "faststart"}
+        with atomic_path(path) as temporary, av.open(str(temporary), "w", format="mp4", options=options) as file:
             stream = file.add_stream("libx264", rate=fps, options={"crf": QUALITY, "preset": "medium"})
             stream.pix_fmt, stream.time_base = "yuv420p", Fraction(1, fps)
             context = stream.codec_context
@@ -39,9 +40,6 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = 24) -> int:
                 file.mux(stream.encode(picture))
                 count += 1
             file.mux(stream.encode())
-        temporary.replace(path)
     except (av.error.FFmpegError, OSError) as error:
         raise UserError(f"{path} cannot be written ({error}): give a file in an existing folder") from error
-    finally:
-        temporary.unlink(missing_ok=True)
     return count

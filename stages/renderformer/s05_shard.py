@@ -22,8 +22,6 @@ from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.renderformer.views import VIEW, view_members
 
-CARD = "README.md"
-
 
 class ShardConfig(StageConfig):
     shard_mb: float = Field(256.0, gt=0)  # size that shards come near: a power of two of scenes each
@@ -117,8 +115,8 @@ def note_objects(objects: dict[str, Any], meta: dict[str, Any]) -> None:
     """Add the objects of a scene: the hash of its mesh, where each is from and under which licence."""
     for entry in meta["objects"]:
         if entry.get("object_id"):
-            told = {name: entry.get(name) for name in ("content_hash", "family", "source", "origin", "licence")}
-            objects.setdefault(entry["object_id"], {**told, "scenes": 0})["scenes"] += 1
+            origin = {name: entry.get(name) for name in ("content_hash", "family", "source", "origin", "licence")}
+            objects.setdefault(entry["object_id"], {**origin, "scenes": 0})["scenes"] += 1
 
 
 def merge(scene: Record, render: Record) -> Record:

@@ -92,7 +92,7 @@ class Evaluate(MapStage):
 
     def prepare(self, config: EvaluateConfig, inputs: Inputs, folder: Path) -> None:
         """The mean training images: up to 1,024 views are read for them, and held as half floats."""
-        from pipeline.store.files import write_atomic
+        from pipeline.atomic import write_atomic
         from stages.graphics.arrays import pack_arrays
 
         write_atomic(folder / MEAN_IMAGES, pack_arrays(mean_training_images(config, inputs)))
@@ -132,11 +132,11 @@ class Evaluate(MapStage):
                 "constant": constant[number],
                 "direct": measure_all(target, sample.views[camera].direct, worker.metrics),
             }
-            shown = {
+            view_facts = {
                 "roughness": visible_roughness(scene, sample.views[camera].triangle),
                 "noise": view_noise(scene.meta, camera),
             }
-            rows.append({"index": camera, **shown, "scores": scores})
+            rows.append({"index": camera, **view_facts, "scores": scores})
             members[f"view{camera}.prediction.exr"] = encode_rgb(prediction)
         facts = {
             "id": item.id,

@@ -135,8 +135,8 @@ def test_measures_of_known_shapes() -> None:
     assert compared["distance"] == pytest.approx(0.05 / np.sqrt(3), rel=0.1) and compared["inside"] == 0 == compared["flipped"]
     vertices, faces = box((1, 1, 1))
     assert measure.Reference(*cube).compare(vertices, faces[:, ::-1])["flipped"] > 0.9
-    hidden = measure.Reference(*join(box((1, 1, 1)), box((0.5, 0.5, 0.5))))
-    assert hidden.outer_share == pytest.approx(6 / 7.5, abs=0.01)
+    hidden = join(box((1, 1, 1)), box((0.5, 0.5, 0.5)))
+    assert len(measure.Reference(*hidden).points) / 4000 == pytest.approx(6 / 7.5, abs=0.01)
     triangle = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
     assert measure.min_angle_deg(triangle, np.array([[0, 1, 2]]))[0] == pytest.approx(45)
 

@@ -10,11 +10,12 @@ from pipeline import commands
 from pipeline.errors import ItemsFailed
 from pipeline.repair import repair
 from pipeline.run import run_pipeline
-from pipeline.store import DRAFT, Store
+from pipeline.status import read_states
+from pipeline.store import DRAFT, Draft, Store
 from pipeline.store.files import read_sealed, write_sealed
-from tests.pipeline.toy import Total
+from tests.pipeline.toy import Numbers, Total
 
-BUG = {"n": 12, "fail": ["n011"]}  # two of the items are in its part
+BUG = {"n": 12, "fail": ["n011"]}  # two of the items are in its part: n009 is done, n011 is not
 
 
 @pytest.fixture
@@ -50,7 +51,7 @@ def notes(lines: list[str]) -> list[str]:
 
 
 def stop(run, **overrides) -> None:
-    """A run that leaves three of the four parts finished."""
+    """A run that leaves three of the four parts finished, and of the fourth one item of two."""
     with pytest.raises(ItemsFailed):
         run(**{"numbers": BUG, **overrides})
 
@@ -61,7 +62,7 @@ def test_a_draft_that_other_code_began_is_continued_and_the_manifest_names_both(
     code("b" * 64)
     stop(run)  # begun by a, nothing finished by b
     artifacts, lines, computed = run()
-    assert len(computed) == 2
+    assert computed == ["n011"]
     (note,) = notes(lines)
     assert "what is finished of toy/numbers was made by other code of the same version; it is kept" in note
     made = artifacts["numbers"].manifest["code"]
@@ -75,7 +76,7 @@ def test_a_draft_that_other_code_began_is_continued_and_the_manifest_names_both(
 def test_code_that_finished_nothing_is_not_named(run, code):
     code("a" * 64)
     with pytest.raises(ItemsFailed):
-        run(numbers={"n": 3, "fail": ["n000", "n001"]})
+        run(numbers={"n": 3, "fail": ["n000", "n001", "n002"]})
     code("b" * 64)
     artifacts, lines, _ = run(numbers={"n": 3})
     assert notes(lines) == [] and "others" not in artifacts["numbers"].manifest["code"]
@@ -94,7 +95,7 @@ def test_a_draft_of_before_codes_were_noted_is_continued(run, tmp_path):
     about = read_sealed(draft / DRAFT)
     write_sealed(draft / DRAFT, {name: value for name, value in about.items() if name not in ("codes", "purpose")})
     artifacts, lines, computed = run()
-    assert len(computed) == 2
+    assert computed == ["n011"]
     assert "made by code that nobody noted" in notes(lines)[0]
     assert artifacts["numbers"].manifest["code"]["others"] == ["unknown"]
 
@@ -120,6 +121,87 @@ def test_a_repair_names_the_code_of_what_it_keeps(run, code, tmp_path, lost):
     mended = repair(Store(tmp_path / "store"), Store(tmp_path / "store").resolve(str(numbers.path)), 0, lines.append)
     assert "what is sound was made by other code of the same version" in notes(lines)[0]
     assert mended.codes == ["b" * 64, "a" * 64] and mended.digest == numbers.digest
+
+
+# -- parts of which an item failed
+
+
+def undisturbed(run, tmp_path, **numbers) -> str:
+    """The digest of the same numbers in a store of their own."""
+    return run(store=str(tmp_path / "undisturbed"), numbers=numbers)[0]["numbers"].digest
+
+
+def states(tmp_path) -> list[dict]:
+    return read_states(Store(tmp_path / "store"))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_failed_item_costs_only_itself(run, tmp_path, monkeypatch, workers):
+    monkeypatch.setattr(Numbers, "part_size", lambda self, config, inputs: 5)
+    with pytest.raises(ItemsFailed):
+        run(workers=workers, numbers={"n": 10, "fail": ["n004"]})  # the third of the five even ones
+    (state,) = states(tmp_path)
+    assert (state["parts_done"], state["parts"], state["done"], state["total"]) == (1, 2, 9, 10)
+    artifacts, lines, computed = run(workers=workers, numbers={"n": 10})
+    assert computed == ["n004"]
+    assert "10 items, 9 of them already there" in " ".join(lines)
+    assert artifacts["numbers"].digest == undisturbed(run, tmp_path, n=10)
+    assert artifacts["numbers"].verify(deep=True) == []
+    assert sorted(path.name for path in artifacts["numbers"].path.iterdir() if path.is_dir()) == ["files", "logs", "parts"]
+
+
+def test_each_run_adds_to_what_a_part_has(run, tmp_path):
+    """The second run mends one of two items; its tar takes the first one's place, and no tar is left behind."""
+    for fail, computed_then in ((["n000", "n004"], 16), (["n004"], 2), (["n004"], 1)):
+        with pytest.raises(ItemsFailed):
+            run(numbers={"n": 16, "fail": fail})
+        assert len((tmp_path / "computed").read_text().split()) == computed_then
+        (draft,) = Store(tmp_path / "store").drafts()
+        assert len(list((draft / "unfinished").iterdir())) == 1 and len(list((draft / "parts").iterdir())) == 4
+    artifacts, _, computed = run(numbers={"n": 16})
+    assert computed == ["n004"] and artifacts["numbers"].digest == undisturbed(run, tmp_path, n=16)
+
+
+def test_rejects_of_an_unfinished_part_are_kept_and_counted(run, tmp_path):
+    with pytest.raises(ItemsFailed):
+        run(numbers={"n": 14, "fail": ["n009"]})  # n013, which is rejected, is in its part
+    assert states(tmp_path)[0]["rejects"] == {"unlucky": 1}
+    artifacts, _, computed = run(numbers={"n": 14})
+    assert computed == ["n009"] and [reject["item"] for reject in artifacts["numbers"].rejects()] == ["n013"]
+    assert artifacts["numbers"].digest == undisturbed(run, tmp_path, n=14)
+
+
+@pytest.mark.parametrize("killed", ["keep_unfinished", "finish_part", "_drop_tar"])
+def test_a_kill_around_an_unfinished_parts_marker_costs_nothing_that_was_kept(run, tmp_path, monkeypatch, killed):
+    """Power fails as the marker is about to be written, or as the tar that it replaces is about to go."""
+    with pytest.raises(ItemsFailed):
+        run(numbers={"n": 8, "fail": ["n000", "n004"]})
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(Draft, killed, interrupt)
+        run(numbers={"n": 8, "fail": [] if killed == "finish_part" else ["n004"]})
+    artifacts, _, computed = run(numbers={"n": 8})
+    assert computed == (["n004"] if killed == "_drop_tar" else ["n000", "n004"])
+    assert artifacts["numbers"].digest == undisturbed(run, tmp_path, n=8)
+    assert artifacts["numbers"].verify(deep=True) == []
+
+
+def test_a_damaged_unfinished_part_is_computed_again(run, tmp_path):
+    with pytest.raises(ItemsFailed):
+        run(numbers={"n": 4, "fail": ["n001", "n003", "n002"]})
+    (draft,) = Store(tmp_path / "store").drafts()
+    (tar,) = (draft / "parts").iterdir()
+    tar.write_bytes(tar.read_bytes()[:-600])
+    artifacts, _, computed = run(numbers={"n": 4})
+    assert len(computed) == 4 and artifacts["numbers"].digest == undisturbed(run, tmp_path, n=4)
+
+
+def test_an_item_that_exceeded_a_limit_in_an_unfinished_part_is_tried_under_a_higher_one(run, tmp_path):
+    with pytest.raises(ItemsFailed):
+        run(workers=1, numbers={"n": 8, "fail": ["n000"], "sleep": ["n002"], "limits": {"wall_s": 0.5}})
+    assert states(tmp_path)[0]["rejects"] == {"time": 1}
+    artifacts, lines, computed = run(workers=1, numbers={"n": 8, "limits": {"wall_s": 60.0}})
+    assert computed == ["n000", "n002"] and "1 item(s) that lower limits rejected" in " ".join(lines)
+    assert artifacts["numbers"].digest == undisturbed(run, tmp_path, n=8)
 
 
 # -- force

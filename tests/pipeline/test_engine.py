@@ -196,14 +196,14 @@ def test_limits_reject_the_item_alone(run, kind, limits, reason):
     assert [(r["item"], r["reason"]) for r in artifacts["numbers"].rejects()] == [("n003", reason)]
 
 
-def test_a_bug_in_one_item_fails_its_part_and_keeps_the_others(run, tmp_path):
+def test_a_bug_in_one_item_leaves_its_part_unfinished_and_keeps_all_other_items(run, tmp_path):
     with pytest.raises(UserError, match="n003") as caught:
         run(numbers={"fail": ["n003"]})
     assert "RuntimeError: a bug" in str(caught.value)
     (draft,) = Store(tmp_path / "store").drafts()
     assert len(list((draft / "markers").iterdir())) == 3  # of 4 parts
     _, lines = run()
-    assert "6 of them already there" in " ".join(lines)
+    assert "9 of them already there" in " ".join(lines)
 
 
 # -- the store
@@ -453,7 +453,10 @@ def test_difference_names_the_parameter(run):
 
 
 def test_import_rules():
-    """The engine knows no mesh, image or tensor; only stages/ imports mesh, renderer and shard libraries."""
+    """The engine knows no mesh, image or tensor; only stages/ imports mesh, renderer and shard libraries.
+
+    ``pipeline.atomic`` is anybody's: it writes files and knows nothing of the engine.
+    """
     import ast
 
     forbidden = {
@@ -469,7 +472,7 @@ def test_import_rules():
                     found = [alias.name for alias in node.names]
                 elif isinstance(node, ast.ImportFrom) and not node.level:
                     found = [node.module]
-                bad = {name.split(".")[0] for name in found} & names
+                bad = {name.split(".")[0] for name in found if name != "pipeline.atomic"} & names
                 assert not bad, f"{path.relative_to(ROOT)}:{node.lineno} imports {bad}"
 
 

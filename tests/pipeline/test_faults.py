@@ -321,7 +321,7 @@ def test_a_full_disk_stops_the_run_and_the_next_one_goes_on(tmp_path):
         parts = {path.name: path.stat().st_ino for path in disk.glob("store/toy/numbers/*.partial/parts/*.tar")}
         found["parts"] = len(parts)
         found["marked"] = len(list(disk.glob("store/toy/numbers/*.partial/markers/[!.]*.json")))
-        found["left over"] = [path.name for path in disk.glob("store/**/.*.tmp")]  # they would take room
+        found["left over"] = [path.name for path in disk.glob("store/**/.*.tmp*")]  # they would take room
         found["again"] = run(numbers=numbers)
         (disk / "ballast").unlink()
         found["room"] = run(numbers=numbers)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.atomic import write_atomic
 from pipeline.config import StageConfig, runtime
 from pipeline.run import run_pipeline
 from pipeline.stage import Item, MapStage, Record, System
-from pipeline.store.files import write_atomic
 
 
 class SharedConfig(StageConfig):

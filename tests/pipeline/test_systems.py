@@ -54,6 +54,13 @@ def test_a_key_holds_the_system_and_renderformers_does_not(tmp_path):
     assert "system" not in collect.preimage and collect.place == "collect" and toy.place == "toy/numbers"
 
 
+@pytest.mark.parametrize("stage", [["squares"], ["toy/squares"], ["tests.pipeline.toy/squares"], ["squares", TOY]])
+def test_why_takes_a_stage_as_ls_writes_it(store, capsys, stage):
+    words = [*stage, "squares.offset=3", f"store={store.root}"]
+    assert cli.main(["why", "--store", str(store.root), *words]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].strip() == "squares.offset: 0 -> 3"
+
+
 def test_an_artifact_is_found_by_stage_system_and_key(store, capsys):
     numbers, squares, total = store.artifacts()
     for reference in ("numbers", "toy/numbers", numbers.name, numbers.key[:8], str(numbers.path)):

@@ -14,6 +14,7 @@ from pipeline.errors import Reject, UserError
 from pipeline.hydra_config import compose
 from pipeline.keys import canonical_json
 from pipeline.stage import Item
+from stages.graphics.geometry.measure import face_normals
 from stages.renderformer.records import SceneRecord
 from stages.renderformer.s03_scene import SampleScene, SceneConfig
 from stages.renderformer.scenes import meshes
@@ -239,7 +240,7 @@ def test_walls_face_inwards():
         assert len(vertices) == 81 and len(faces) == 128
         still = Placement(name, "wall", [0, 0, 0], [1, 1, 1], [0, 0, 0], Material([0, 0, 0], 0, 1, False, False, 0))
         placed = place(vertices, still)
-        assert np.allclose(meshes.face_normals(placed[faces]), inward)
+        assert np.allclose(face_normals(placed[faces]), inward)
         assert np.allclose(placed @ inward, -0.5) and np.abs(placed).max() == 0.5
 
 
@@ -265,7 +266,7 @@ def test_crease_angle():
     vertices, faces = meshes.special("cube", 4)
     groups = meshes.shading_groups(vertices, faces, 30)
     assert len(set(groups)) == 6
-    assert np.allclose(meshes.smooth_normals(vertices, faces, groups), meshes.face_normals(vertices[faces])[:, None])
+    assert np.allclose(meshes.smooth_normals(vertices, faces, groups), face_normals(vertices[faces])[:, None])
     vertices, faces = meshes.special("sphere", 7)
     groups = meshes.shading_groups(vertices, faces, 30)
     assert len(set(groups)) == 1

@@ -165,7 +165,9 @@ def test_card_tells_what_is_there_and_its_reader_works(made):
         "of 8 views rendered twice" in card and "0.0200 in the mean" in card and "31.0 dB" in card and "0.0300 in the" in card
     )
     assert "https://example.org/train-blob" in card and '"shard_mb": 256' in card
-    assert page.count("data:image/png;base64,") == 2 and "<script" not in page and "http" not in page.split("<h2")[0]
+    assert page.count("data:image/png;base64,") == 1 and page.count("<svg") == 1  # contact sheet, distributions
+    assert not re.search(r'(src|href)="(?!data:|#)', page)  # one file, nothing to fetch
+    assert "<script" not in page and "http" not in page.split("<h2")[0]
     for name in artifact.read(artifact.ids()[0]).members:
         assert re.sub(r"\d", r"\\<i>", name) in card
     snippet = next(block for block in re.findall(r"```\n(.*?)```", card, re.S) if "def read_scene" in block)

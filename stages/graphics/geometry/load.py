@@ -22,6 +22,7 @@ import numpy as np
 
 from pipeline.errors import Reject
 from stages.graphics.geometry import colours
+from stages.graphics.geometry.measure import normal_vectors
 from stages.graphics.geometry.paths import check_path, inside
 from stages.graphics.geometry.records import TextureRecord
 
@@ -146,7 +147,7 @@ def _settled(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[n
     if extent < EXTENT_RANGE[0] or extent < 1e-6 * np.abs(vertices).max():
         raise Reject("degenerate", f"longest side {extent:.3g}")
     corners = (vertices / extent)[faces]
-    double_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    double_area = np.linalg.norm(normal_vectors(corners), axis=1)
     solid = double_area > 1e-14
     if double_area.sum() < 1e-8:
         raise Reject("degenerate", f"area {double_area.sum() / 2:.3g} of the squared longest side")

@@ -17,10 +17,21 @@ def corners_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.asarray(vertices, np.float64)[faces]
 
 
+def normal_vectors(corners: np.ndarray) -> np.ndarray:
+    """(F, 3) normals of (F, 3, 3) triangles, each as long as twice the triangle's area."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def face_normals(corners: np.ndarray) -> np.ndarray:
+    """(F, 3) unit normals of (F, 3, 3) triangles; +z for those without area."""
+    vectors = normal_vectors(corners)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 0, vectors / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+
+
 def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F, 3): normal times twice the area of each face."""
-    a, b, c = np.moveaxis(corners_of(vertices, faces), 1, 0)
-    return np.cross(b - a, c - a)
+    """(F, 3): ``normal_vectors`` of a mesh."""
+    return normal_vectors(corners_of(vertices, faces))
 
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -219,7 +230,6 @@ class Reference:
         points, normals = sample(self.vertices, self.faces, number)
         outer = Visibility(self.vertices, self.faces).outer(points, normals)
         self.points = points[outer] if outer.any() else points
-        self.outer_share = float(outer.mean())
 
     def compare(self, vertices: np.ndarray, faces: np.ndarray) -> dict[str, float]:
         """distance: mean of the two directed mean distances; kept: share of the outer surface within 1 %; inside: share

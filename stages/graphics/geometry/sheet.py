@@ -8,20 +8,18 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stages.graphics.geometry import measure
 
 TILE = 128  # pixels
-ANGLES = (0.6, 0.45)  # turn about z, then tilt, radians
+ANGLES = (-0.6, 0.45)  # about z, then about x, radians
 LIGHT = np.array([-0.4, -0.75, 0.55]) / np.linalg.norm([-0.4, -0.75, 0.55])  # towards it; the camera looks along +y, z up
 
 
 def picture(vertices: np.ndarray, faces: np.ndarray, tile: int = TILE) -> np.ndarray:
     """(tile, tile, 3) uint8, flat shading by the face normal; where the back of a face shows, red. z up."""
-    turn, tilt = ANGLES
-    rotation = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]) @ np.array(
-        [[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
-    )
+    rotation = Rotation.from_euler("zx", ANGLES).as_matrix()
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     points = ((vertices - (low + high) / 2) / max(float(np.linalg.norm(high - low)), 1e-9)) @ rotation.T
     fine = 2 * tile

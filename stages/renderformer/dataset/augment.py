@@ -104,7 +104,10 @@ def expose(example: Batch, factor: float) -> Batch:
 
 
 def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation about the vector by its length in radians (Rodrigues)."""
+    """(3, 3) rotation about the vector by its length in radians (Rodrigues).
+
+    SciPy's differs in the last bits, so a training would no longer repeat an earlier one bit by bit.
+    """
     angle = np.linalg.norm(vector)
     if angle == 0:
         return np.eye(3)

@@ -1,30 +1,40 @@
 """The dataset card: what is in the shards, for people, as Markdown and as one HTML page that opens from disk.
 
 Reads the draft of a *shard* artifact; writes ``README.md``, ``card.html``, ``distributions.png`` and ``contact.png``. One
-design choice: the content is built once, as sections of paragraphs, tables, code and pictures, and written twice.
+design choice: the content is built once, as sections of text, tables, code and pictures, and written twice.
 
 Counts are of everything; distributions and ranges are of at most ``SAMPLED`` scenes, evenly spaced over each split.
 """
 
 from __future__ import annotations
 
-import base64
-import html
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from stages.graphics.page import Cell, Code, Picture, Section, Table, Text, embed, render
+from stages.graphics.page.parts import Block
+from stages.renderformer.dataset.distributions import (
+    Quantities,
+    measure_scenes,
+    noise_floor,
+    plot_distributions,
+    ranges,
+    split_order,
+)
 from stages.renderformer.dataset.encoding import READ
 
+TITLE = "Dataset card"
 SAMPLED = 1000  # scenes per split that distributions are drawn from
 SHEET = 5  # scenes per split on the contact sheet
 SHEET_SIDE = 128  # pixels of a view on it, at most
 LISTED = 1000  # objects named in the card; objects.json names all
+DISTRIBUTIONS_SIZE = (15, 8.5)  # inches
 
 # field, shape, dtype, unit and frame and range
 SCENE_FIELDS = (
@@ -76,147 +86,100 @@ for sample in webdataset.WebDataset("parts/<digest>.tar", shardshuffle=False):
 """
 
 
-@dataclass
-class Section:
-    """A heading and its blocks: ("text", str), ("table", header, rows), ("code", str), ("picture", file name, caption)."""
+Rows = Sequence[Mapping[str, Any]]  # lines of index.jsonl, without members
 
-    title: str
-    blocks: list[tuple] = field(default_factory=list)
+
+@dataclass(frozen=True)
+class Dataset:
+    """What a card is written of.
+
+    by_split: the samples of each split. shards, objects: shards.json and objects.json, by split. measured: quantities of some
+    scenes of each split. preimages: what decided each stage's artifact, by stage. key: the shard artifact's.
+    """
+
+    by_split: Mapping[str, Rows]
+    shards: Mapping[str, Any]
+    objects: Mapping[str, Any]
+    measured: Mapping[str, Quantities]
+    preimages: Mapping[str, Any]
+    key: str
+
+    @property
+    def splits(self) -> list[str]:
+        return sorted(self.by_split, key=split_order)
+
+    @property
+    def samples(self) -> list[Mapping[str, Any]]:
+        return [sample for rows in self.by_split.values() for sample in rows]
+
+    @property
+    def views(self) -> int:
+        return sum(len(sample["views"]) for sample in self.samples)
+
+    @property
+    def resolution(self) -> int:
+        return max(sample["resolution"] for sample in self.samples)
 
 
 def write_card(config: Any, inputs: Mapping[str, Any], draft: Any) -> None:
     """The card of a draft whose ``index.jsonl``, ``shards.json`` and ``objects.json`` are written."""
-    from pipeline.store import history
-
-    with open(draft.files / "index.jsonl", encoding="utf-8") as file:
-        facts = [{name: value for name, value in json.loads(line).items() if name != "members"} for line in file]
-    shards, objects = (json.loads((draft.files / f"{name}.json").read_text()) for name in ("shards", "objects"))
-    by_split: dict[str, list[dict[str, Any]]] = {}
-    for fact in facts:
-        by_split.setdefault(fact["split"], []).append(fact)
-    drawn = {split: gather(draft, rows[:: -(-len(rows) // SAMPLED)]) for split, rows in by_split.items()}
-    plot_distributions(drawn, draft.files / "distributions.png")
-    contact_sheet(draft, by_split).save(draft.files / "contact.png")
-    preimages = {**dict(reversed(history(inputs).items())), "shard": draft.preimage}
-    card = sections(shards, by_split, objects, drawn, preimages, draft.key)
-    (draft.files / "README.md").write_text(to_markdown(card), encoding="utf-8")
-    (draft.files / "card.html").write_text(to_html(card, draft.files), encoding="utf-8")
-
-
-# --- what is in it ----------------------------------------------------------------------------------------------------
-
-
-def gather(draft: Any, rows: Iterable[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Quantity -> its values over the scenes (lights, cameras, views, triangles of them)."""
-    from stages.graphics.arrays import unpack_json
-    from stages.renderformer.dataset.encoding import decode_scene
-
-    out: dict[str, list[Any]] = {
-        name: []
-        for name in (
-            "triangles", "lights", "roughness", "camera distance", "light distance", "field of view", "mean radiance",
-            "samples", "error", "clamped", "emission", "vertex", "bytes", "noise", "noise relit", "noise psnr", "textured",
-        )
-    }  # fmt: skip
-    for row in rows:
-        members = draft.read(row["id"], ["scene.npz", "meta.json"]).members
-        scene = decode_scene(row["id"], members["scene.npz"], members["meta.json"])
-        reflects = scene.light_index < 0
-        out["triangles"].append([len(scene.triangles)])
-        out["lights"].append([scene.n_lights])
-        out["textured"].append([0.0 if scene.patch_index is None else np.mean(scene.patch_index >= 0)])
-        out["roughness"].append(scene.roughness[reflects])
-        out["emission"].append(scene.emission[~reflects].max(axis=1))
-        out["vertex"].append([scene.triangles[reflects].min(initial=0), scene.triangles[reflects].max(initial=0)])
-        views = unpack_json(members["meta.json"])["views"]
-        out["camera distance"].append(np.linalg.norm(scene.camera_to_world[views, :3, 3], axis=1))
-        out["field of view"].append(scene.fov_deg[views])
-        for light in range(scene.n_lights):
-            out["light distance"].append([np.linalg.norm(scene.triangles[scene.light_index == light].mean(axis=(0, 1)))])
-        for view in scene.meta["render"]["views"]:
-            if view.get("status") == "ok":
-                for name, key in (("mean radiance", "mean"), ("samples", "spp"), ("error", "error"), ("clamped", "clamped")):
-                    if view.get(key) is not None:
-                        out[name].append([view[key]])
-                if noise := view.get("noise"):  # of views that were rendered twice
-                    out["noise"].append([noise["sum"]["log_error"]])
-                    out["noise psnr"].append([noise["sum"]["psnr"]])
-                    out["noise relit"].append([one["log_error"] for one in noise["reweighted"]])
-        out["bytes"].append([len(members["scene.npz"])])
-    return {name: np.concatenate(values).astype(float) if values else np.zeros(0) for name, values in out.items()}
-
-
-PLOTS = (  # quantity, label, scale
-    ("triangles", "triangles per scene", "linear"),
-    ("lights", "lights per scene", "integer"),
-    ("textured", "share of textured triangles per scene", "linear"),
-    ("roughness", "roughness, per triangle", "linear"),
-    ("emission", "emission of a light's triangle", "log"),
-    ("camera distance", "camera to origin, scene units", "linear"),
-    ("light distance", "light to origin, scene units", "linear"),
-    ("field of view", "field of view, degrees", "linear"),
-    ("mean radiance", "exposure: mean radiance of a view", "log"),
-    ("samples", "samples per pixel of a view", "log2"),
-    ("error", "estimated error of a view, log10(1 + x)", "log"),
-    ("noise", "noise floor of a view, log10(1 + x)", "log"),
-)
-
-
-def plot_distributions(drawn: Mapping[str, Mapping[str, np.ndarray]], path: Path) -> None:
-    """A histogram per quantity, a line per split, each normalised to shares."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15, 8.5), layout="constrained")
-    for axes, (name, label, scale) in zip(figure.subplots(3, 4).flat, PLOTS, strict=True):
-        values = {split: columns[name] for split, columns in drawn.items() if len(columns[name])}
-        every = np.concatenate(list(values.values())) if values else np.zeros(0)
-        axes.set_xlabel(label)
-        if scale in ("log", "log2"):
-            every = every[every > 0]
-        if not len(every):
-            axes.text(0.5, 0.5, "not estimated", ha="center", va="center", transform=axes.transAxes)
-            axes.set(xticks=[], yticks=[])
-            continue
-        low, high = every.min(), every.max()
-        if high - low <= 1e-6 * abs(high):  # constant: one bar over the value
-            scale = "constant"
-            edges = low + np.array([-0.5, 0.5]) * (abs(low) or 1.0)
-        elif scale == "integer":
-            edges = np.arange(np.floor(low), np.floor(high) + 2) - 0.5
-        elif scale == "log2":
-            edges = 2.0 ** (np.arange(np.floor(np.log2(low)), np.floor(np.log2(high)) + 2) - 0.5)
-        else:
-            bins = int(np.clip(2 * len(every) ** 0.5, 8, 40))
-            edges = (np.geomspace if scale == "log" else np.linspace)(low, high, bins + 1)
-        for (split, mine), color in zip(sorted(values.items(), key=lambda item: ORDER.get(item[0], 9)), COLORS, strict=False):
-            shares = np.histogram(mine, edges)[0] / len(mine)
-            style = {"fill": True, "alpha": 0.35} if split == "train" else {"linewidth": 1.5}
-            axes.stairs(shares, edges, label=f"{split} ({len(mine):,})", color=color, **style)
-        if scale in ("log", "log2"):
-            axes.set_xscale("log", base=2 if scale == "log2" else 10)
-            if scale == "log2":
-                ticks = 2.0 ** np.arange(np.floor(np.log2(low)), np.floor(np.log2(high)) + 1)
-            elif high > 30 * low:
-                ticks = 10.0 ** np.arange(np.ceil(np.log10(low)), np.floor(np.log10(high)) + 1)
-            else:  # no or one power of ten in it
-                ticks = np.array([float(f"{tick:.2g}") for tick in np.geomspace(edges[0], edges[-1], 4)])
-            ticks = ticks[:: -(-len(ticks) // 6)]
-            axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-            axes.minorticks_off()
-        if scale == "constant":
-            axes.set_xticks([low], [f"{low:.4g}"])
-            axes.set_xlim(*(edges + np.diff(edges) * [-1, 1]))
-        axes.set_ylabel("share")
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
-    figure.savefig(path, dpi=90)
+    dataset = read_dataset(inputs, draft)
+    figure = Figure(figsize=DISTRIBUTIONS_SIZE, layout="constrained")
+    plot_distributions(figure, dataset.measured)
+    figure.savefig(draft.files / "distributions.png", dpi=90)
+    contact_sheet(draft, dataset.by_split).save(draft.files / "contact.png")
+    (draft.files / "README.md").write_text(to_markdown(dataset), encoding="utf-8")
+    (draft.files / "card.html").write_text(to_html(dataset, draft.files), encoding="utf-8")
 
 
-ORDER = {"train": 0, "validation": 1, "test": 2}
-COLORS = ("tab:blue", "tab:orange", "tab:red", "tab:green")
+def read_dataset(inputs: Mapping[str, Any], draft: Any) -> Dataset:
+    from pipeline.store import history
+
+    by_split: dict[str, list[dict[str, Any]]] = {}
+    with open(draft.files / "index.jsonl", encoding="utf-8") as file:
+        for line in file:
+            sample = {name: value for name, value in json.loads(line).items() if name != "members"}
+            by_split.setdefault(sample["split"], []).append(sample)
+    shards, objects = (json.loads((draft.files / f"{name}.json").read_text()) for name in ("shards", "objects"))
+    measured = {split: measure_scenes(draft, rows[:: -(-len(rows) // SAMPLED)]) for split, rows in by_split.items()}
+    preimages = {**dict(reversed(history(inputs).items())), "shard": draft.preimage}
+    return Dataset(by_split, shards, objects, measured, preimages, draft.key)
 
 
-def contact_sheet(draft: Any, by_split: Mapping[str, list[Mapping[str, Any]]]) -> Any:
+def to_markdown(dataset: Dataset) -> str:
+    from stages.graphics.page import markdown
+
+    return markdown.document(TITLE, [*lead(dataset), CONTACT], sections(dataset, [DISTRIBUTIONS]))
+
+
+def to_html(dataset: Dataset, folder: Path) -> str:
+    """One page, with its pictures inside it, and with the distributions as SVG."""
+    from stages.graphics.page.plots import svg
+
+    return render(
+        Path(__file__).with_name("card.html.j2"),
+        TITLE,
+        lead=lead(dataset),
+        tiles={
+            "scenes": f"{len(dataset.samples):,}",
+            "views": f"{dataset.views:,}",
+            "pixels": f"{dataset.resolution} × {dataset.resolution}",
+            "objects": f"{sum(map(len, dataset.objects.values())):,}",
+            "megabytes": f"{sum(shard['bytes'] for shard in dataset.shards.values()) / 1e6:,.1f}",
+        },
+        contact=replace(CONTACT, source=embed((folder / CONTACT.source).read_bytes())),
+        distributions=svg(lambda figure: plot_distributions(figure, dataset.measured), *DISTRIBUTIONS_SIZE),
+        sections=sections(dataset, []),
+    )
+
+
+CONTACT = Picture("contact.png", "Scenes of each split, a row each, every scene with its own exposure")
+DISTRIBUTIONS = Picture("distributions.png", f"Shares per split, of at most {SAMPLED:,} scenes each")
+
+
+def contact_sheet(draft: Any, by_split: Mapping[str, Rows]) -> Any:
     """A row per scene with its views, a column of rows per split; every scene with its own exposure, sRGB."""
     from PIL import Image, ImageDraw
 
@@ -226,7 +189,7 @@ def contact_sheet(draft: Any, by_split: Mapping[str, list[Mapping[str, Any]]]) -
 
     margin, title = 8, 18
     columns = []
-    for split in sorted(by_split, key=lambda name: ORDER.get(name, 9)):
+    for split in sorted(by_split, key=split_order):
         rows = by_split[split]
         chosen = [rows[i] for i in np.unique(np.linspace(0, len(rows) - 1, SHEET).round().astype(int))]
         pictures = []
@@ -254,130 +217,116 @@ def contact_sheet(draft: Any, by_split: Mapping[str, list[Mapping[str, Any]]]) -
 # --- the content ------------------------------------------------------------------------------------------------------
 
 
-def sections(
-    shards: Mapping[str, Any],
-    by_split: Mapping[str, list[dict[str, Any]]],
-    objects: Mapping[str, Any],
-    drawn: Mapping[str, Mapping[str, np.ndarray]],
-    preimages: Mapping[str, Any],
-    key: str,
-) -> list[Section]:
-    """The card's content."""
-    splits = sorted(by_split, key=lambda name: ORDER.get(name, 9))
-    views = sum(len(row["views"]) for rows in by_split.values() for row in rows)
-    scenes = sum(map(len, by_split.values()))
-    resolution = max(row["resolution"] for rows in by_split.values() for row in rows)
-    every = {name: np.concatenate([columns[name] for columns in drawn.values()]) for name in next(iter(drawn.values()))}
-    about = Section("Dataset card")
-    about.blocks += [
-        ("text", f"Path-traced triangle scenes for neural renderers: {scenes:,} scenes, {views:,} views of {resolution} x "
-         f"{resolution} pixels, a layer of linear radiance for each light. Artifact key {key}."),
-        ("text", "One sample per scene in webdataset tars (`parts/*.tar`, members `<id>.<member>`), in a fixed order. One unit "
-         "is the scene's box, about [-0.5, 0.5]^3 (walls may stick out; lights and cameras stand outside); z up, right-handed. "
-         "Radiance is linear RGB, without units. F triangles, V cameras, L lights, H x W pixels, row 0 on top."),
-        ("picture", "contact.png", "Scenes of each split, a row each, every scene with its own exposure"),
-    ]  # fmt: skip
-
-    fields = Section("Fields")
-    fields.blocks += [
-        ("table", ("member", "field", "shape", "dtype", "unit, frame, range"),
-         [("scene.npz", *row) for row in SCENE_FIELDS] + [tuple(row) for row in VIEW_MEMBERS]),
-        ("text", "`scene.npz` read with numpy alone, a row per triangle, float32 (error of a vertex at most scale / 2 an axis, "
-         "of a normal 3e-5, of a material 2.5e-4):"),
-        ("code", READ.strip()),
-    ]  # fmt: skip
-    fields.blocks.append(("table", ("range of", "least", "median", "largest"), ranges(drawn)))
-
-    counts = Section("Counts and splits")
-    rows = []
-    for split in splits:
-        mine, shard = by_split[split], shards[split]
-        faces = [row["triangles"] for row in mine]
-        rows.append((
-            split, f"{len(mine):,}", f"{sum(len(row['views']) for row in mine):,}", f"{min(faces)}..{max(faces)}",
-            f"{len(objects.get(split, {})):,}", len(shard["parts"]), f"{shard['bytes'] / 1e6:.1f}", shard["digest"],
-        ))  # fmt: skip
-    counts.blocks += [
-        ("table", ("split", "scenes", "views", "triangles", "objects", "shards", "MB", "digest of samples"), rows),
-        ("text", "No object is in two splits: checked over all samples when this was made. Which objects are held out, and "
-         "with them the test scenes, follows from the seeds below; two copies whose test digests agree give comparable "
-         "numbers. Walls, lights and the simple shapes of special scenes are made by code and belong to no split."),
-    ]  # fmt: skip
-    kinds = Counter(row["scene"] for rows in by_split.values() for row in rows)
-    counts.blocks.append(("table", ("kind of scene", "scenes"), [(name, f"{n:,}") for name, n in sorted(kinds.items())]))
-
-    shown = Section("Distributions")
-    shown.blocks.append(("picture", "distributions.png", f"Shares per split, of at most {SAMPLED:,} scenes each"))
-    shown.blocks.append(("text", noise_floor(every)))
-    samples, clamped = every["samples"], int(every["clamped"].sum())
-    spp = f"{np.median(samples):g} in the median, {samples.min():g}..{samples.max():g}" if len(samples) else "not noted"
-    shown.blocks.append(("text", f"Samples per pixel: {spp}. Radiance values clamped at 65,504: {clamped:,}."))
-
-    origins = Section("Objects, origins and licences")
-    known: Counter = Counter()
-    for ids in objects.values():
-        known.update((str(o["licence"] or "unknown"), source_of(o["source"])) for o in ids.values())
-    origins.blocks.append(("table", ("licence", "source", "objects"), [(*pair, f"{n:,}") for pair, n in sorted(known.items())]))
-    listed = [
-        (split, id, o["source"] or "", o["origin"] or "", o["licence"] or "unknown", o["scenes"])
-        for split in splits
-        for id, o in sorted(objects.get(split, {}).items())
+def lead(dataset: Dataset) -> list[Block]:
+    """What stands below the title."""
+    return [
+        Text(
+            f"Path-traced triangle scenes for neural renderers: {len(dataset.samples):,} scenes, {dataset.views:,} views of "
+            f"{dataset.resolution} x {dataset.resolution} pixels, a layer of linear radiance for each light. Artifact key "
+            f"{dataset.key}."
+        ),
+        Text(
+            "One sample per scene in webdataset tars (`parts/*.tar`, members `<id>.<member>`), in a fixed order. One unit "
+            "is the scene's box, about [-0.5, 0.5]^3 (walls may stick out; lights and cameras stand outside); z up, "
+            "right-handed. Radiance is linear RGB, without units. F triangles, V cameras, L lights, H x W pixels, row 0 on top."
+        ),
     ]
-    if len(listed) > LISTED:
-        origins.blocks.append(("text", f"The first {LISTED:,} of {len(listed):,}; `objects.json` names all."))
-    origins.blocks.append(("table", ("split", "object", "source", "origin", "licence", "scenes"), listed[:LISTED]))
-
-    made = Section("How it was made")
-    made.blocks.append(("text", f"The key {key} is the hash of stage, version, parameters and the keys of its inputs."))
-    for stage, preimage in preimages.items():
-        made.blocks.append(("text", f"**{stage}** (version {preimage['version']}, reads {inputs_of(preimage)})"))
-        made.blocks.append(("code", json.dumps(preimage["params"], indent=1, sort_keys=True)))
-
-    files = Section("Reading it")
-    files.blocks += [
-        ("text", "`index.jsonl` has a line per sample in the shards' order: id, split, shard, triangles, lights, views, "
-         "resolution, kind of scene, and members: name to [offset in the shard, bytes, CRC-32], so that a member is one seek. "
-         "`shards.json` lists the shards of each split with bytes and samples; a shard's name is the blake2b-256 of its bytes. "
-         "Plain webdataset:"),
-        ("code", WEBDATASET.strip()),
-    ]  # fmt: skip
-    return [about, fields, counts, shown, origins, made, files]
 
 
-def noise_floor(every: Mapping[str, np.ndarray]) -> str:
-    """How far images are from noiseless ones: of views rendered twice, and as the renderer estimates it."""
-
-    def spread(values: np.ndarray) -> str:
-        return (
-            f"{values.mean():.4f} in the mean, {np.median(values):.4f} in the median, {np.quantile(values, 0.95):.4f} at 95 %"
-        )
-
-    noise, errors = every["noise"], every["error"]
-    told = []
-    if len(noise):
-        told.append(
-            f"Noise floor, of {len(noise):,} views rendered twice, independently: mean absolute error of log10(1 + radiance) "
-            f"{spread(noise)}; PSNR of values clamped to 1 {every['noise psnr'].mean():.1f} dB; with reweighted lights "
-            f"{spread(every['noise relit'])}."
-        )
-    if len(errors):
-        told.append(f"Error of a view as the renderer estimates it, log10(1 + radiance): {spread(errors)}.")
-    return " ".join(told) or "Noise floor: not measured; every view has a fixed number of samples and was rendered once."
+def sections(dataset: Dataset, distributions: Sequence[Block]) -> list[Section]:
+    """The card's sections. distributions: how their plots are shown."""
+    return [
+        Section("Fields", field_blocks(dataset)),
+        Section("Counts and splits", count_blocks(dataset)),
+        Section("Distributions", [*distributions, *sample_blocks(dataset)]),
+        Section("Objects, origins and licences", origin_blocks(dataset)),
+        Section("How it was made", history_blocks(dataset)),
+        Section("Reading it", READING),
+    ]
 
 
-def ranges(drawn: Mapping[str, Mapping[str, np.ndarray]]) -> list[tuple[str, ...]]:
-    """What was measured: (quantity, least, median, largest)."""
-    labels = {
-        "vertex": "vertex coordinate (without lights)",
-        **{name: label for name, label, _ in PLOTS},
-        "bytes": "bytes of scene.npz",
-    }
+def field_blocks(dataset: Dataset) -> list[Block]:
+    fields = [("scene.npz", *row) for row in SCENE_FIELDS] + [*VIEW_MEMBERS]
+    rows = [[*(Cell(name, kind="code") for name in names), meaning] for *names, meaning in fields]
+    return [
+        Table(("member", "field", "shape", "dtype", "unit, frame, range"), rows),
+        Text(
+            "`scene.npz` read with numpy alone, a row per triangle, float32 (error of a vertex at most scale / 2 an axis, "
+            "of a normal 3e-5, of a material 2.5e-4):"
+        ),
+        Code(READ.strip()),
+        Table(("range of", "least", "median", "largest"), ranges(dataset.measured), numeric=True),
+    ]
+
+
+def count_blocks(dataset: Dataset) -> list[Block]:
     rows = []
-    for name, label in labels.items():
-        values = np.concatenate([columns[name] for columns in drawn.values()])
-        if len(values):
-            rows.append((label, *(f"{value:.4g}" for value in (values.min(), np.median(values), values.max()))))
-    return rows
+    for split in dataset.splits:
+        samples, shard = dataset.by_split[split], dataset.shards[split]
+        faces = [sample["triangles"] for sample in samples]
+        rows.append((
+            split, f"{len(samples):,}", f"{sum(len(sample['views']) for sample in samples):,}", f"{min(faces)}..{max(faces)}",
+            f"{len(dataset.objects.get(split, {})):,}", len(shard["parts"]), f"{shard['bytes'] / 1e6:.1f}", shard["digest"],
+        ))  # fmt: skip
+    kinds = Counter(sample["scene"] for sample in dataset.samples)
+    return [
+        Table(("split", "scenes", "views", "triangles", "objects", "shards", "MB", "digest of samples"), rows),
+        Text(
+            "No object is in two splits: checked over all samples when this was made. Which objects are held out, and "
+            "with them the test scenes, follows from the seeds below; two copies whose test digests agree give comparable "
+            "numbers. Walls, lights and the simple shapes of special scenes are made by code and belong to no split."
+        ),
+        Table(("kind of scene", "scenes"), [(kind, f"{count:,}") for kind, count in sorted(kinds.items())], numeric=True),
+    ]
+
+
+def sample_blocks(dataset: Dataset) -> list[Block]:
+    """How good the images are: noise, samples per pixel, clamped values."""
+    columns = dataset.measured.values()
+    pooled = {name: np.concatenate([measured[name] for measured in columns]) for name in next(iter(columns))}
+    samples, clamped = pooled["samples"], int(pooled["clamped"].sum())
+    spp = f"{np.median(samples):g} in the median, {samples.min():g}..{samples.max():g}" if len(samples) else "not noted"
+    return [
+        Text(noise_floor(pooled)),
+        Text(f"Samples per pixel: {spp}. Radiance values clamped at 65,504: {clamped:,}."),
+    ]
+
+
+def origin_blocks(dataset: Dataset) -> list[Block]:
+    counts: Counter[tuple[str, str]] = Counter()
+    for objects in dataset.objects.values():
+        counts.update((str(origin["licence"] or "unknown"), source_of(origin["source"])) for origin in objects.values())
+    objects = [
+        (split, id, origin["source"] or "", origin["origin"] or "", origin["licence"] or "unknown", origin["scenes"])
+        for split in dataset.splits
+        for id, origin in sorted(dataset.objects.get(split, {}).items())
+    ]
+    cut = [Text(f"The first {LISTED:,} of {len(objects):,}; `objects.json` names all.")] if len(objects) > LISTED else []
+    return [
+        Table(("licence", "source", "objects"), [(*pair, f"{count:,}") for pair, count in sorted(counts.items())]),
+        *cut,
+        Table(("split", "object", "source", "origin", "licence", "scenes"), objects[:LISTED]),
+    ]
+
+
+def history_blocks(dataset: Dataset) -> list[Block]:
+    """Every stage's parameters."""
+    blocks: list[Block] = [Text(f"The key {dataset.key} is the hash of stage, version, parameters and the keys of its inputs.")]
+    for stage, preimage in dataset.preimages.items():
+        blocks.append(Text(f"**{stage}** (version {preimage['version']}, reads {inputs_of(preimage)})"))
+        blocks.append(Code(json.dumps(preimage["params"], indent=1, sort_keys=True)))
+    return blocks
+
+
+READING = (
+    Text(
+        "`index.jsonl` has a line per sample in the shards' order: id, split, shard, triangles, lights, views, "
+        "resolution, kind of scene, and members: name to [offset in the shard, bytes, CRC-32], so that a member is one seek. "
+        "`shards.json` lists the shards of each split with bytes and samples; a shard's name is the blake2b-256 of its bytes. "
+        "Plain webdataset:"
+    ),
+    Code(WEBDATASET.strip()),
+)
 
 
 def source_of(source: str | None) -> str:
@@ -388,75 +337,3 @@ def source_of(source: str | None) -> str:
 
 def inputs_of(preimage: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {key[:12]}" for name, key in preimage["inputs"].items()) or "nothing"
-
-
-# --- written twice ----------------------------------------------------------------------------------------------------
-
-
-def to_markdown(card: Iterable[Section]) -> str:
-    lines: list[str] = []
-    for number, section in enumerate(card):
-        lines += ["#" * (1 if number == 0 else 2) + f" {section.title}", ""]
-        for kind, *content in section.blocks:
-            if kind == "text":
-                lines += [content[0], ""]
-            elif kind == "code":
-                lines += ["```", content[0], "```", ""]
-            elif kind == "picture":
-                lines += [f"![{content[1]}]({content[0]})", "", f"*{content[1]}*", ""]
-            else:
-                header, rows = content
-                lines += ["| " + " | ".join(header) + " |", "| " + " | ".join("---" for _ in header) + " |"]
-                lines += [f"| {' | '.join(map(_cell, row))} |" for row in rows] + [""]
-    return "\n".join(lines)
-
-
-def _cell(value: Any) -> str:
-    """A table's cell: on one line, and nothing in it that Markdown would read."""
-    return " ".join(str(value).split()).replace("|", "\\|").replace("<", "\\<")
-
-
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1150px; margin: 2em auto; padding: 0 1em; color: #222 }
-table { border-collapse: collapse; margin: 1em 0; font-size: 13px; display: block; overflow-x: auto }
-th, td { border: 1px solid #ccc; padding: 3px 8px; text-align: left; vertical-align: top }
-th { background: #f2f2f2 } code, pre { font: 12.5px/1.4 ui-monospace, monospace; background: #f6f6f6 }
-pre { padding: .8em; overflow-x: auto; max-height: 30em } figure { margin: 1em 0 } img { max-width: 100% }
-figcaption { color: #666; font-size: 13px }
-"""
-
-
-def to_html(card: Iterable[Section], folder: Path) -> str:
-    """One page, its pictures inside it."""
-    out = ["<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Dataset card</title>"]
-    out += [f"<style>{STYLE}</style></head><body>"]
-    for number, section in enumerate(card):
-        level = 1 if number == 0 else 2
-        out.append(f"<h{level}>{html.escape(section.title)}</h{level}>")
-        for kind, *content in section.blocks:
-            if kind == "text":
-                out.append(f"<p>{_inline(content[0])}</p>")
-            elif kind == "code":
-                out.append(f"<pre>{html.escape(content[0])}</pre>")
-            elif kind == "picture":
-                data = base64.b64encode((folder / content[0]).read_bytes()).decode()
-                caption = html.escape(content[1])
-                out.append(f"<figure><img src='data:image/png;base64,{data}' alt='{caption}'>")
-                out.append(f"<figcaption>{caption}</figcaption></figure>")
-            else:
-                header, rows = content
-                cells = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
-                out.append(f"<table><tr>{cells}</tr>")
-                out += ["<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows]
-                out.append("</table>")
-    return "\n".join([*out, "</body></html>\n"])
-
-
-def _inline(text: str) -> str:
-    """Escaped text in which `code` and **bold** are marked up."""
-    for mark, tag in (("`", "code"), ("**", "b")):
-        pieces = text.split(mark)
-        if mark == "`":
-            pieces = [html.escape(piece, quote=False) for piece in pieces]
-        text = "".join(f"<{tag}>{piece}</{tag}>" if i % 2 else piece for i, piece in enumerate(pieces))
-    return text

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.atomic import atomic_path
 from pipeline.errors import UserError
 from pipeline.store import RECORD_ID
 from stages.renderformer.records import PATCH_CHANNELS, PATCH_KEPT, PATCH_NORMAL, TEXTURED_CHANNELS, SceneRecord
@@ -38,11 +39,9 @@ def write_hdf5(path: Path, scene: SceneRecord) -> None:
     """The scene as a released HDF5 file, deflated as the released ones are; the file appears whole or not at all."""
     import h5py
 
-    temporary = path.with_name(path.name + ".tmp")
-    with h5py.File(temporary, "w") as file:
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         for name, array in released_arrays(scene).items():
             file.create_dataset(name, data=array, compression="gzip", compression_opts=9)
-    temporary.replace(path)
 
 
 def export(source: Any, out: Path, splits: list[str] | None = None, images: bool = False) -> Iterator[Path]:

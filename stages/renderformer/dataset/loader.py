@@ -138,8 +138,8 @@ class Batches:
 
     def sequence(self) -> str:
         """Hex digest of all that decides which batch follows which: not of rank, world or workers."""
-        told = json.dumps([self.config.model_dump(mode="json"), self.dataset.split, self.dataset.ids], sort_keys=True)
-        return hashlib.blake2b(told.encode() + self.dataset.triangles.tobytes(), digest_size=16).hexdigest()
+        recipe = json.dumps([self.config.model_dump(mode="json"), self.dataset.split, self.dataset.ids], sort_keys=True)
+        return hashlib.blake2b(recipe.encode() + self.dataset.triangles.tobytes(), digest_size=16).hexdigest()
 
     def _index(self, position: int) -> tuple[int, int]:
         """Epoch and dataset index at that position of the endless sequence of epochs."""

@@ -15,7 +15,6 @@ import hashlib
 import json
 import os
 import re
-import tempfile
 import threading
 import zlib
 from collections import OrderedDict
@@ -26,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.atomic import atomic_path
 from pipeline.errors import UserError
 from pipeline.store import RECORD_ID
 from stages.graphics.exr import decode_lights
@@ -132,9 +132,15 @@ class Remote:
     def _make_room(self, keep: Path) -> None:
         """Drop the shards that were not used for longest; readers that have one open are not disturbed."""
         with self._lock:
-            found = [(path, path.stat()) for path in keep.parent.glob("*.tar")]
+<<<<<<< HEAD
+            found = [(path, path.stat()) for path in keep.parent.glob("[!.]*.tar")]
             total = sum(stat.st_size for _, stat in found)
             for path, stat in sorted(found, key=lambda item: item[1].st_mtime_ns):
+=======
+            files = [(path, path.stat()) for path in keep.parent.glob("*.tar")]
+            total = sum(stat.st_size for _, stat in files)
+            for path, stat in sorted(files, key=lambda item: item[1].st_mtime_ns):
+>>>>>>> h_pages
                 if total > self.limit and path != keep:
                     path.unlink(missing_ok=True)
                     total -= stat.st_size
@@ -144,22 +150,19 @@ class Remote:
 
         url, digest = self.url(name), hashlib.blake2b(digest_size=32)
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=".", suffix=".tmp")
         try:
-            with os.fdopen(handle, "wb") as file, gopen(url) as stream:
-                while block := stream.read(1 << 20):
-                    digest.update(block)
-                    file.write(block)
-            match = SHARD.match(name)
-            if match and digest.hexdigest() != match[1]:
-                raise DamagedShard(f"{url} does not hash to its name: the shard is damaged or was cut on the way")
-            os.replace(temporary, target)
+            with atomic_path(target) as temporary:
+                with open(temporary, "wb") as file, gopen(url) as stream:
+                    while block := stream.read(1 << 20):
+                        digest.update(block)
+                        file.write(block)
+                match = SHARD.match(name)
+                if match and digest.hexdigest() != match[1]:
+                    raise DamagedShard(f"{url} does not hash to its name: the shard is damaged or was cut on the way")
         except DamagedShard:
             raise
         except (OSError, ValueError) as error:
             raise UserError(f"{url} cannot be read ({error})") from error
-        finally:
-            Path(temporary).unlink(missing_ok=True)
 
 
 def open_source(source: Any, cache_folder: Path | str | None = None, cache_gb: float | None = None) -> Folder | Remote:

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.atomic import write_atomic
 from pipeline.errors import UserError
 from pipeline.hydra_config import CONF
-from pipeline.store.files import write_atomic
 
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Store
@@ -174,7 +174,7 @@ def difference(row: Result, base: Result) -> dict[str, dict[str, float]]:
         }
 
     ours, theirs = scores(row), scores(base)
-    found = {}
+    gains = {}
     for metric in COLUMNS:
         pairs = [
             [ours[scene][view][metric] - theirs[scene][view][metric] for view in sorted(ours[scene])]
@@ -182,8 +182,8 @@ def difference(row: Result, base: Result) -> dict[str, dict[str, float]]:
             if metric in next(iter(ours[scene].values()))
         ]
         if pairs:
-            found[metric] = bootstrap(pairs)
-    return found
+            gains[metric] = bootstrap(pairs)
+    return gains
 
 
 def settings(job: Job, full: Job | None, result: Result | None) -> dict[str, str]:
@@ -198,8 +198,8 @@ def settings(job: Job, full: Job | None, result: Result | None) -> dict[str, str
         ) if on
     ]  # fmt: skip
     asked = scene.count.model_dump() if hasattr(scene, "count") else {}  # imported scenes are as many as there are files
-    made = result.metrics["data"]["scenes"] if result else asked
-    scenes = made.get("train", 0)
+    scene_counts = result.metrics["data"]["scenes"] if result else asked
+    scenes = scene_counts.get("train", 0)
     loss = "L1 of log10(1 + x)" + (f", {train.lpips:g} LPIPS" if train.lpips else "")
     peak = f"learning rate {train.lr:g}" + (f", {train.muon_lr:g} of matrices" if train.optimizer == "muon" else "")
     start = "informed" if train.informed_start is True else "random"
@@ -282,12 +282,12 @@ def gather(table: str, jobs: Mapping[str, Job]) -> dict[str, Any]:
 def write_table(table: str, names: Sequence[str] | None, overrides: Sequence[str], out: Path) -> int:
     """Write table.md, table.json and table.png into ``out``; 1 if a row that was asked for is not in the store."""
     jobs = jobs_of(table, names, overrides)
-    found = gather(table, jobs)
+    numbers = gather(table, jobs)
     out.mkdir(parents=True, exist_ok=True)
-    write_atomic(out / "table.json", (json.dumps(found, indent=1, allow_nan=False) + "\n").encode())
-    write_atomic(out / "table.md", markdown(found).encode())
-    draw(found, out / "table.png")
-    lacking = [row["name"] for row in found["rows"] if row["name"] in jobs and "ours" not in row]
+    write_atomic(out / "table.json", (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode())
+    write_atomic(out / "table.md", markdown(numbers).encode())
+    draw(numbers, out / "table.png")
+    lacking = [row["name"] for row in numbers["rows"] if row["name"] in jobs and "ours" not in row]
     if lacking:
         print(f"not in the store: {', '.join(lacking)} (lightmill sweep {table} makes what is missing)")
     print(out / "table.md")
@@ -329,36 +329,36 @@ def _size(row: Mapping[str, Any]) -> list[str]:
     return [layers, str(row["width"]), f"{row['parameters'] / 1e6:.1f}M", row["paper_parameters"]]
 
 
-def markdown(found: Mapping[str, Any]) -> str:
+def markdown(numbers: Mapping[str, Any]) -> str:
     """The whole page."""
     from stages.graphics.statistics import METHODS
 
     columns = []
     for name, column in COLUMNS.items():
         columns += [f"{column} {'↑' if name in ('psnr', 'ssim') else '↓'}", "paper"]
-    figures = [[row["label"], *_size(row), *_pairs(row.get("ours", {}), row["paper"])] for row in found["rows"]]
-    figures += [[f"*{METHODS[name]}*", "", "", "", "", *_pairs(scores, {})] for name, scores in found["bars"].items()]
+    figures = [[row["label"], *_size(row), *_pairs(row.get("ours", {}), row["paper"])] for row in numbers["rows"]]
+    figures += [[f"*{METHODS[name]}*", "", "", "", "", *_pairs(scores, {})] for name, scores in numbers["bars"].items()]
     gaps = [
         [row["label"], *_pairs(row.get("difference", {}), row.get("paper_difference", {}), "+")]
-        for row in found["rows"]
+        for row in numbers["rows"]
         if row["name"] != BASE
     ]
     training = [
         [row["label"], *("–" if value is None else f"{value:,.{digits}f}" for value, digits in zip(
             [row["training"][name] for name in ("loss", "largest_grad_norm", "skipped", "seconds")], (4, 3, 0, 0), strict=True
         ))]
-        for row in found["rows"]
+        for row in numbers["rows"]
         if "ours" in row
     ]  # fmt: skip
-    here = found["settings"]["here"]
-    measured = any("lpips_vgg" in row.get("ours", {}) for row in found["rows"])
+    here = numbers["settings"]["here"]
+    measured = any("lpips_vgg" in row.get("ours", {}) for row in numbers["rows"])
     lines = [
-        f"# Table 1 of the paper: {found['table']}",
+        f"# Table 1 of the paper: {numbers['table']}",
         "",
         "The paper's figures stand beside ours to compare the order of the rows and the size of their differences, not "
         "the figures themselves: the last table says how much smaller our runs are. Means over views, with 95 % intervals "
         "under resampling of scenes. PSNR and SSIM are of linear values clamped to [0, 1], FLIP is HDR-FLIP. All rows: one "
-        f"dataset (shard {found['shard'][:12]}), one recipe, one seed, the same batches in the same order."
+        f"dataset (shard {numbers['shard'][:12]}), one recipe, one seed, the same batches in the same order."
         + ("" if measured else " LPIPS is measured where its weights are given (evaluate.lpips=vgg, docs/training.md)."),
         "",
         *_table(["variant", "layers", "width", "parameters", "paper", *columns], figures),
@@ -375,18 +375,20 @@ def markdown(found: Mapping[str, Any]) -> str:
         *_table(["variant", "last loss", "largest gradient norm", "steps skipped", "seconds"], training),
         "## What differs from the paper",
         "",
-        *_table(["", "paper", "here"], [[name, text, here[name]] for name, text in found["settings"]["paper"].items()], left=3),
+        *_table(
+            ["", "paper", "here"], [[name, text, here[name]] for name, text in numbers["settings"]["paper"].items()], left=3
+        ),
         "The authors later found a shader bug in the paper's training data and trained the released models anew, so that the "
         "paper's figures are not theirs either.",
     ]
     return "\n".join(lines) + "\n"
 
 
-def draw(found: Mapping[str, Any], path: Path) -> None:
+def draw(numbers: Mapping[str, Any], path: Path) -> None:
     """Differences to the full model, a panel per metric of `DRAWN`: ours with their intervals, the paper's beside them."""
     from matplotlib.figure import Figure
 
-    rows = [row for row in found["rows"] if row["name"] != BASE][::-1]  # the first on top
+    rows = [row for row in numbers["rows"] if row["name"] != BASE][::-1]  # the first on top
     figure = Figure(figsize=(9, 0.36 * len(rows) + 1.6), layout="constrained")
     panels = figure.subplots(1, len(DRAWN), sharey=True)
     for axes, metric in zip(panels, DRAWN, strict=True):

@@ -42,12 +42,12 @@ def noise_pairs(shard: Artifact, split: str) -> tuple[list[list[dict[str, float]
     from stages.graphics.arrays import unpack_json
 
     def of(ids: list[str]) -> list[list[dict[str, float]]]:
-        found = []
+        scene_pairs = []
         for id in ids[:: len(ids) // MOST + 1]:
             meta = unpack_json(shard.read(id, ("meta.json",)).members["meta.json"])
             pairs = [view_noise(meta, camera)["pair"] for camera in meta["views"]]
-            found.append([pair for pair in pairs if pair is not None])
-        return [pairs for pairs in found if pairs]
+            scene_pairs.append([pair for pair in pairs if pair is not None])
+        return [pairs for pairs in scene_pairs if pairs]
 
     own = of(shard.ids(split))
     return (own, split) if sum(map(len, own)) >= ENOUGH else (of(shard.ids()), "all splits")
@@ -58,18 +58,18 @@ def ceiling(scenes: Sequence[Scene], split: str, pairs: Sequence[Sequence[Mappin
 
     scenes: those evaluated, of ``split``. pairs, where: see `noise_pairs`.
     """
-    told = {}
+    ceilings = {}
 
-    def tell(metric: str, values: Sequence[Sequence[float]], of: str, source: str) -> None:
+    def add(metric: str, values: Sequence[Sequence[float]], of: str, source: str) -> None:
         if values:
             counts = {"views": sum(map(len, values)), "scenes": len(values)}
-            told[metric] = {**bootstrap(values, METRICS[metric].bounds), **counts, "of": of, "from": source}
+            ceilings[metric] = {**bootstrap(values, METRICS[metric].bounds), **counts, "of": of, "from": source}
 
     estimates = [[view["noise"]["log_error"] for view in scene["views"]] for scene in scenes]
     estimates = [known for scene in estimates if (known := [value for value in scene if value is not None])]
-    tell("psnr", [[pair["psnr"] for pair in scene] for scene in pairs], where, "pairs")
+    add("psnr", [[pair["psnr"] for pair in scene] for scene in pairs], where, "pairs")
     if estimates:
-        tell("log_error", estimates, split, "estimates")
+        add("log_error", estimates, split, "estimates")
     else:
-        tell("log_error", [[pair["log_error"] for pair in scene] for scene in pairs], where, "pairs")
-    return told
+        add("log_error", [[pair["log_error"] for pair in scene] for scene in pairs], where, "pairs")
+    return ceilings

@@ -1,55 +1,17 @@
-"""The report's plots as SVG elements that take their ink from the page, so that they follow its light or dark setting."""
+"""The report's plots: loss curves, and scores by what a scene or a view holds."""
 
 from __future__ import annotations
 
-import io
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from stages.graphics.metrics import Metric
+from stages.graphics.page.plots import INK, colour, svg_axes
 from stages.graphics.statistics import BREAKDOWNS, METHODS
 
-COLOURS = ("#4c8dd6", "#e08a2e", "#3aa673", "#b66bd1", "#d1566a", "#8a8f2b", "#2aa7b8", "#a3765a")  # read on white and on black
-INK, LINE = "#808890", "#909aa4"  # stand for the page's colours: replaced by its variables
 REFERENCES = {"direct": "D", "constant": "_"}  # method -> marker
-
-
-def colour(index: int) -> str:
-    return COLOURS[index % len(COLOURS)]
-
-
-def _svg(draw: Callable[[Any], None], width: float, height: float, columns: Sequence[float] = (1,), share: bool = False) -> str:
-    """``draw(axes)`` on a row of axes with these relative widths (a single one for one), in inches, as an SVG element."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    style = {
-        "svg.hashsalt": "lightmill",
-        "svg.fonttype": "none",
-        **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK),
-        "font.size": 10,
-        "font.family": "sans-serif",
-        "grid.color": LINE,
-        "grid.linewidth": 0.6,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-    }
-    with matplotlib.rc_context(style):
-        figure, axes = pyplot.subplots(
-            1, len(columns), figsize=(width, height), layout="constrained", width_ratios=columns, sharey=share, squeeze=False
-        )
-        draw(list(axes[0]) if len(columns) > 1 else axes[0][0])
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-        pyplot.close(figure)
-    text = buffer.getvalue()
-    text = re.sub(r'<g id="[^"]*"', "<g", text[text.index("<svg") :])  # a page holds many plots, an id only once
-    return text.replace(INK, "var(--soft)").replace(LINE, "var(--line)")
 
 
 def loss_curves(logs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
@@ -62,28 +24,37 @@ def loss_curves(logs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
 
         for number, (name, rows) in enumerate(logs.items()):
             train = np.array([(row["step"], row["loss"]) for row in rows if row.get("loss") is not None]).reshape(-1, 2)
-            held_out = np.array([(row["step"], row[key]) for row in rows if row.get(key) is not None]).reshape(-1, 2)
-            ours, theirs = (colour(0), colour(1)) if len(logs) == 1 else (colour(number),) * 2
-            of = "" if len(logs) == 1 else f"{name}: "
+            validation = np.array([(row["step"], row[key]) for row in rows if row.get(key) is not None]).reshape(-1, 2)
+            train_colour, validation_colour = (colour(0), colour(1)) if len(logs) == 1 else (colour(number),) * 2
+            prefix = "" if len(logs) == 1 else f"{name}: "
             width = max(1, len(train) // 50)  # smoothed over 2 % of the run
             axes.plot(
-                *train.T, color=ours, linewidth=0.8, alpha=0.4 if width > 1 else 1, marker="o" if len(train) < 3 else None
+                *train.T,
+                color=train_colour,
+                linewidth=0.8,
+                alpha=0.4 if width > 1 else 1,
+                marker="o" if len(train) < 3 else None,
             )
             if width > 1:
                 smooth = np.convolve(train[:, 1], np.ones(width) / width, mode="valid")
-                axes.plot(train[width - 1 :, 0], smooth, color=ours, linewidth=1.6)
-            axes.plot([], [], color=ours, label=f"{of}training loss" + (f" (bold: mean of {width} rows)" if width > 1 else ""))
-            if len(held_out):
+                axes.plot(train[width - 1 :, 0], smooth, color=train_colour, linewidth=1.6)
+            axes.plot(
+                [],
+                [],
+                color=train_colour,
+                label=f"{prefix}training loss" + (f" (bold: mean of {width} rows)" if width > 1 else ""),
+            )
+            if len(validation):
                 style = {"linestyle": "-" if len(logs) == 1 else "--", "linewidth": 1.6, "marker": "o", "markersize": 3}
-                axes.plot(*held_out.T, color=theirs, label=f"{of}validation, log error", **style)
+                axes.plot(*validation.T, color=validation_colour, label=f"{prefix}validation, log error", **style)
         axes.set(xlabel="step", ylabel="loss", yscale="log")
         axes.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
         axes.yaxis.set_minor_formatter(ticker.NullFormatter())
         axes.grid(which="both")
-        axes.legend(frameon=False, labelcolor=INK)
+        axes.legend()
 
-    return _svg(draw, 11, 3.4) if logs else ""
+    return svg_axes(draw, 11, 3.4) if logs else ""
 
 
 def breakdowns(runs: Mapping[str, Mapping[str, Any]], metric: Metric, references: bool) -> str:
@@ -93,8 +64,8 @@ def breakdowns(runs: Mapping[str, Mapping[str, Any]], metric: Metric, references
     """
     bins = {}
     for key, breakdown in BREAKDOWNS.items():
-        found = {row["value"] for summary in runs.values() for row in summary["by"][key]}
-        bins[key] = sorted(found, key=breakdown.order)
+        values = {row["value"] for summary in runs.values() for row in summary["by"][key]}
+        bins[key] = sorted(values, key=breakdown.order)
 
     def draw(panels: list[Any]) -> None:
         for axes, (key, breakdown) in zip(panels, BREAKDOWNS.items(), strict=True):
@@ -125,9 +96,7 @@ def breakdowns(runs: Mapping[str, Mapping[str, Any]], metric: Metric, references
             axes.grid(axis="y")
         panels[0].set_ylabel(metric.heading.replace("\u00a0", " "))
         handles, labels = panels[0].get_legend_handles_labels()
-        panels[0].figure.legend(
-            handles, labels, loc="outside upper left", ncols=min(len(labels), 6), frameon=False, labelcolor=INK
-        )
+        panels[0].figure.legend(handles, labels, loc="outside upper left", ncols=min(len(labels), 6))
 
     columns = [max(2, len(values)) for values in bins.values()]
-    return _svg(draw, 13, 3.4, columns, share=True)
+    return svg_axes(draw, 13, 3.4, columns)

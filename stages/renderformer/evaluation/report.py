@@ -7,16 +7,16 @@ pictures, times 5. The page follows the reader's light or dark setting.
 
 from __future__ import annotations
 
-import base64
-import io
-import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from stages.graphics.metrics import Metric
+from stages.graphics.page import Cell, Picture, Table, embed, png, render
 from stages.graphics.statistics import BREAKDOWNS, decided, worst_first
 from stages.graphics.tonemap import exposure_for, to_picture
 from stages.renderformer.evaluation import plots, tables
@@ -27,42 +27,52 @@ from stages.renderformer.inference.compare import DIFFERENCE_GAIN, error_picture
 OVERVIEW_VIEWS = 10  # columns of overview.png
 OVERVIEW_VIEW_PIXELS = 128  # least width of a column
 TITLES = ("Probes of a model", "How close the model comes to the path tracer", "Models side by side")  # by number of runs
-SHOWN = ("psnr", "ssim", "log_error", "flip")  # beside every view, and in breakdowns
+VIEW_METRICS = ("psnr", "ssim", "log_error", "flip")  # beside every view
 
 
-def picture_uri(data: bytes) -> str:
-    """A PNG as a data URI."""
-    return "data:image/png;base64," + base64.b64encode(data).decode()
+@dataclass(frozen=True)
+class View:
+    """One view in the gallery: where it stands from the worst, what it shows, and its pictures.
+
+    shared: pictures that all runs have in common. own: the pictures of each run. scores: metric -> value, of each run.
+    """
+
+    rank: int
+    scene: Mapping[str, Any]
+    view: Mapping[str, Any]
+    exposure: float
+    scores: Sequence[Mapping[str, float]]
+    shared: Sequence[Picture]
+    own: Sequence[Sequence[Picture]]
+
+    @property
+    def facts(self) -> str:
+        lights = self.scene["lights"]
+        facts = [f"view {self.view['index']}", self.scene["template"], f"{lights} light{'' if lights == 1 else 's'}"]
+        facts.append(f"{self.scene['triangles']} triangles")
+        facts += [] if self.view["roughness"] is None else [f"roughness {self.view['roughness']:.2f}"]
+        return " · ".join([*facts, f"exposure ×{self.exposure:g}"])
 
 
-def png(pixels: np.ndarray) -> bytes:
-    """(H, W, 3) uint8."""
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG", optimize=True)
-    return buffer.getvalue()
-
-
-def view_pictures(runs: Sequence[Images]) -> tuple[list[tuple[str, str]], list[list[tuple[str, str]]], float]:
-    """Pictures of one view as [(caption, data URI)]: those that all runs share, those of each run; and the exposure."""
+def view_pictures(runs: Sequence[Images], name: str) -> tuple[list[Picture], list[list[Picture]], float]:
+    """Pictures of one view: those that all runs share, those of each run; and the exposure. name: of scene and view."""
     target = runs[0]["target"]
     exposure = exposure_for(target)
 
-    def uri(pixels: np.ndarray) -> str:
-        return picture_uri(png(np.ascontiguousarray(pixels)))
+    def picture(caption: str, pixels: np.ndarray) -> Picture:
+        return Picture(embed(png(np.ascontiguousarray(pixels))), caption, f"{caption}, {name}", pixels=True)
 
-    def own(prediction: np.ndarray) -> list[tuple[str, str]]:
+    def own(prediction: np.ndarray) -> list[Picture]:
         difference, flip = error_pictures(target, prediction, exposure)
         return [
-            ("prediction", uri(to_picture(prediction, exposure))),
-            (f"difference ×{DIFFERENCE_GAIN}", uri(difference)),
-            ("HDR-FLIP error", uri(flip)),
+            picture("prediction", to_picture(prediction, exposure)),
+            picture(f"difference ×{DIFFERENCE_GAIN}", difference),
+            picture("HDR-FLIP error", flip),
         ]
 
     shared = [
-        ("target", uri(to_picture(target, exposure))),
-        ("direct light only", uri(to_picture(runs[0]["direct"], exposure))),
+        picture("target", to_picture(target, exposure)),
+        picture("direct light only", to_picture(runs[0]["direct"], exposure)),
     ]
     return shared, [own(images["prediction"]) for images in runs], exposure
 
@@ -76,98 +86,202 @@ def overview(images: Sequence[Images], enlarge: int) -> np.ndarray:
     return np.concatenate(columns, axis=1).repeat(enlarge, axis=0).repeat(enlarge, axis=1)
 
 
-def gallery(runs: Sequence[Run], limit: int) -> tuple[list[dict[str, Any]], int]:
-    """The views shown, worst first, and how many there are. Runs on different data show what they have in common."""
+def gallery(runs: Sequence[Run], limit: int) -> tuple[list[View], int]:
+    """The gallery's views, worst first, and how many there are. Runs on different data show what they have in common."""
     same = tables.same_scenes(runs) if len(runs) > 1 else {scene["id"] for run in runs for scene in run.summary["per_scene"]}
     scenes = [[scene for scene in run.summary["per_scene"] if scene["id"] in same] for run in runs]
     rows = []
-    for rank, found, views in worst_first(scenes, limit):
-        images = [run.images(found[0]["id"], views[0]["index"]) for run in runs]
-        shared, own, exposure = view_pictures(images)
-        scores = [view["scores"]["model"] for view in views]
-        facts = {"rank": rank, "scene": found[0], "view": views[0], "exposure": exposure, "scores": scores}
-        rows.append({**facts, "shared": shared, "own": own})
+    for rank, run_scenes, views in worst_first(scenes, limit):
+        scene, view = run_scenes[0], views[0]
+        images = [run.images(scene["id"], view["index"]) for run in runs]
+        shared, own, exposure = view_pictures(images, f"{scene['id']} view {view['index']}")
+        rows.append(View(rank, scene, view, exposure, [view["scores"]["model"] for view in views], shared, own))
     return rows, sum(len(scene["views"]) for scene in scenes[0]) if scenes else 0
 
 
-def timing_rows(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """The median times as rows: ``{"label", "kind", "ms": a number or None per run}``; ``kind`` is scene, image or sum."""
+# --- tables -----------------------------------------------------------------------------------------------------------
 
-    def of(steps: Sequence[str]) -> list[float | None]:
-        return [1000 * sum(run.timing["median"][step] for step in steps) if run.timing else None for run in runs]
 
-    once = [step for step in STEPS if step not in PER_IMAGE]
-    kinds = {step: "image" if step in PER_IMAGE else "scene" for step in STEPS}
-    rows = [{"label": label, "kind": kinds[step], "ms": of([step])} for step, label in STEPS.items()]
-    rows.append({"label": "first image of a scene", "kind": "sum", "ms": of(list(STEPS))})
-    rows.append({"label": "every further image", "kind": "sum", "ms": of(PER_IMAGE)})
-    rows.append({"label": "share of the per-scene part in the first", "kind": "share", "ms": of(once)})
-    total = rows[-3]["ms"]
-    rows[-1]["ms"] = [part / whole if part is not None else None for part, whole in zip(rows[-1]["ms"], total, strict=True)]
-    return rows
+def run_headings(runs: Sequence[Run], alone: str) -> list[Cell | str]:
+    """The runs' names with their colours; ``alone`` where there is one."""
+    return [alone] if len(runs) == 1 else [Cell(run.name, colour=plots.colour(number)) for number, run in enumerate(runs)]
+
+
+def summary_table(runs: Sequence[Run], metrics: Mapping[str, Metric]) -> Table:
+    """Rows are metrics; columns the runs and what they are seen against. The best is marked where scenes are the same."""
+    columns = tables.columns(runs)
+    best = tables.best_of(columns, metrics) if tables.all_same(runs) else dict.fromkeys(metrics)
+    known = [(number, column) for number, column in enumerate(columns) if column["values"]]
+
+    def heading(number: int, column: Mapping[str, Any]) -> Cell:
+        is_model = column["kind"] == "model"
+        return Cell(
+            column["label"],
+            kind="strong" if is_model else "",
+            colour=plots.colour(number) if is_model and len(runs) > 1 else "",
+        )
+
+    def score(name: str, number: int, column: Mapping[str, Any]) -> Cell | None:
+        if name not in column["values"]:
+            return None
+        kind = "best" if best[name] == number else "soft" if column["kind"] in ("direct", "ceiling") else ""
+        return Cell(*tables.format_estimate(metrics[name], column["values"][name]), kind=kind)
+
+    rows = [[metric.heading, *(score(name, *column) for column in known)] for name, metric in metrics.items()]
+    return Table(["metric", *(heading(*column) for column in known)], rows, numeric=True)
+
+
+def difference_table(runs: Sequence[Run], differences: Mapping[str, Any], metrics: Mapping[str, Metric]) -> Table:
+    """How much better each run is than the first, coloured where the interval leaves no doubt."""
+
+    def gain(name: str, row: Mapping[str, Any]) -> Cell | None:
+        if name not in row["gains"]:
+            return None
+        value = row["gains"][name]
+        kind = ("good" if value["mean"] > 0 else "bad") if decided(value) else ""
+        return Cell(*tables.format_estimate(metrics[name], value, "+"), kind=kind)
+
+    rows = [[tables.with_unit(metric), *(gain(name, row) for row in differences.values())] for name, metric in metrics.items()]
+    return Table([f"how much better than {runs[0].name}", *differences], rows, numeric=True)
+
+
+def breakdown_tables(runs: Sequence[Run]) -> list[Table]:
+    """The scores in every bin of every breakdown, a table for each run and breakdown."""
+    return [breakdown_table(run, key, len(runs) > 1) for run in runs for key in BREAKDOWNS]
+
+
+def breakdown_table(run: Run, key: str, several: bool) -> Table:
+    metrics = tables.metrics_of([run.summary])
+
+    def score(row: Mapping[str, Any], name: str, metric: Metric) -> Cell:
+        interval = row["interval"][name]
+        note = f"{metric.format(interval[0])} to {metric.format(interval[1])}" if interval else ""
+        return Cell(metric.format(row["model"][name]), note)
+
+    title = BREAKDOWNS[key].title + (f", {run.name}" if several else "")
+    rows = [
+        [row["value"], row["scenes"], row["views"], *(score(row, name, metric) for name, metric in metrics.items())]
+        for row in run.summary["by"][key]
+    ]
+    return Table([title, "scenes", "views", *(metric.heading for metric in metrics.values())], rows, numeric=True)
+
+
+def timing_table(runs: Sequence[Run]) -> Table:
+    """Median milliseconds of every step and of their sums, with a bar for each."""
+
+    def milliseconds(run: Run, steps: Iterable[str]) -> float:
+        return 1000 * sum(run.timing["median"][step] for step in steps)
+
+    per_scene = [step for step in STEPS if step not in PER_IMAGE]
+    longest = max(milliseconds(run, STEPS) for run in runs if run.timing)
+
+    def cells(steps: Iterable[str], kind: str = "") -> list[Cell | None]:
+        times = [milliseconds(run, steps) if run.timing else None for run in runs]
+        return [
+            None if ms is None else Cell(f"{ms:.1f}", kind=kind, colour=plots.colour(number), share=ms / longest)
+            for number, ms in enumerate(times)
+        ]
+
+    shares = [f"{100 * milliseconds(run, per_scene) / milliseconds(run, STEPS):.0f} %" if run.timing else None for run in runs]
+    rows = [[label, *cells([step])] for step, label in STEPS.items()]
+    rows.append([Cell("first image of a scene", kind="strong"), *cells(STEPS, "strong")])
+    rows.append([Cell("every further image", kind="strong"), *cells(PER_IMAGE, "strong")])
+    rows.append(["share of the per-scene part in the first", *shares])
+    return Table(["milliseconds", *run_headings(runs, "model")], rows, numeric=True)
+
+
+def timing_note(timing: Mapping[str, Any]) -> str:
+    """Where and how the times of a run were measured."""
+    triangles = [scene["triangles"] for scene in timing["scenes"]]
+    threads = timing["threads"]
+    cores = f", {threads} thread{'' if threads == 1 else 's'}" if threads else ""
+    return (
+        f"{timing['device']}{cores}, float32, {timing['resolution']}×{timing['resolution']} pixels, one image at a time. "
+        f"Median of {len(triangles)} scenes of {min(triangles)} to {max(triangles)} triangles, each the least of "
+        f"{timing['repeats']} runs."
+    )
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
 
 
 def _grouped(texts: Sequence[str], runs: Sequence[Run]) -> dict[str, str]:
     """Text -> the names of the runs of which it is true; "" where it is of all."""
-    names = {text: [run.name for run, own in zip(runs, texts, strict=True) if own == text] for text in texts}
-    return {text: "" if len(names) == 1 else ", ".join(found) for text, found in names.items()}
+    names = {text: [run.name for run, run_text in zip(runs, texts, strict=True) if run_text == text] for text in texts}
+    return {text: "" if len(names) == 1 else ", ".join(of_text) for text, of_text in names.items()}
 
 
 def page(runs: Sequence[Run], probes: Sequence[Probe] = (), limit: int = 24, title: str | None = None) -> str:
     """The whole report as HTML; at most ``limit`` views in the gallery."""
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    summaries = [run.summary for run in runs]
-    metrics = tables.metrics_of(summaries)
-    table = tables.columns(runs) if runs else []
-    rows, views = gallery(runs, limit) if runs else ([], 0)
-    same = tables.all_same(runs)
-    named_runs = {run.name: run.summary for run in runs}
-    return environment.get_template("report.html.j2").render(
-        title=title or TITLES[min(len(runs), 2)],
+    return render(
+        Path(__file__).with_name("report.html.j2"),
+        title or TITLES[min(len(runs), 2)],
         runs=runs,
-        same=same,
-        metrics=metrics,
-        shown=[name for name in SHOWN if name in metrics],
-        table=table,
-        best=tables.best_of(table, metrics) if runs and same else dict.fromkeys(metrics),
-        told=tables.told,
-        decided=decided,
-        verdicts=[tables.verdicts(summary) for summary in summaries],
-        ceilings=_grouped([" ".join(tables.ceiling_lines(summary)) for summary in summaries], runs),
-        shares=[(run.name, share) for run in runs if (share := tables.noise_share(run.summary)) is not None],
-        differences=tables.differences(runs) if len(runs) > 1 else {},
-        unlike=tables.unlike(runs) if len(runs) > 1 else {},
-        breakdowns=BREAKDOWNS,
-        plots=[plots.breakdowns(named_runs, metrics[name], same) for name in ("psnr", "log_error", "flip")] if runs else [],
-        loss_svg=plots.loss_curves({run.name: run.log for run in runs}),
-        colours=list(itertools.islice(itertools.cycle(plots.COLOURS), len(runs))),
-        timing=timing_rows(runs) if any(run.timing for run in runs) else [],
-        configs=[{stage: tables.flatten(config) for stage, config in run.configs.items()} for run in runs],
-        rows=rows,
-        views=views,
-        probes=[
-            {
-                "facts": probe.facts,
-                "key": probe.key,
-                "figure": picture_uri(probe.figure.read_bytes()),
-                "model": ", ".join(f"{name} {value[:12]}" for name, value in tables.flatten(probe.facts["model"])),
-            }
-            for probe in probes
-        ],
+        colours=[plots.colour(number) for number in range(len(runs))],
+        probes=[probe_values(probe) for probe in probes],
+        **(run_values(runs, limit) if runs else {}),
     )
+
+
+def run_values(runs: Sequence[Run], limit: int) -> dict[str, Any]:
+    """What the template says about runs."""
+    summaries = [run.summary for run in runs]
+    metrics, same = tables.metrics_of(summaries), tables.all_same(runs)
+    differences = tables.differences(runs) if len(runs) > 1 else {}
+    unlike = tables.unlike(runs) if len(runs) > 1 else {}
+    named = {run.name: run.summary for run in runs}
+    views, view_count = gallery(runs, limit)
+    return {
+        "same": same,
+        "metrics": metrics,
+        "view_metrics": {name: metrics[name] for name in VIEW_METRICS if name in metrics},
+        "verdicts": [tables.verdicts(summary) for summary in summaries],
+        "tiles": tiles(summaries[0]) if len(runs) == 1 else {},
+        "summary": summary_table(runs, metrics),
+        "ceilings": _grouped([" ".join(tables.ceiling_lines(summary)) for summary in summaries], runs),
+        "noise_shares": [(run.name, share) for run in runs if (share := tables.noise_share(run.summary)) is not None],
+        "differences": difference_table(runs, differences, metrics) if differences else None,
+        "paired": next(iter(differences.values()), None),
+        "unlike": Table(["setting", *run_headings(runs, "")], [[name, *values] for name, values in unlike.items()]),
+        "configs": [{stage: tables.flatten(config) for stage, config in run.configs.items()} for run in runs],
+        "loss_curves": plots.loss_curves({run.name: run.log for run in runs}),
+        "breakdowns": BREAKDOWNS,
+        "breakdown_plots": [plots.breakdowns(named, metrics[name], same) for name in ("psnr", "log_error", "flip")],
+        "breakdown_tables": breakdown_tables(runs),
+        "timing": timing_table(runs) if any(run.timing for run in runs) else None,
+        "timing_notes": [(run.name, timing_note(run.timing)) for run in runs if run.timing],
+        "views": views,
+        "view_count": view_count,
+    }
+
+
+def tiles(summary: Mapping[str, Any]) -> dict[str, Cell]:
+    """The scores that are judged, for the top of the page of one run."""
+    metrics, model = tables.metrics_of([summary]), summary["methods"]["model"]
+    estimates = {
+        metrics[name].heading: tables.format_estimate(metrics[name], model[name]) for name in VIEW_METRICS if name in model
+    }
+    return {label: Cell(mean, "" if mean == interval else interval) for label, (mean, interval) in estimates.items()}
+
+
+def probe_values(probe: Probe) -> dict[str, Any]:
+    """What the template says about a probe."""
+    facts = probe.facts
+    return {
+        "facts": facts,
+        "key": probe.key[:12],
+        "figure": Picture(embed(probe.figure.read_bytes()), alt=facts["title"]),
+        "table": Table(facts["columns"], facts["rows"], numeric=True),
+        "model": ", ".join(f"{name} {value[:12]}" for name, value in tables.flatten(facts["model"])),
+    }
 
 
 def write_evaluation(folder: Path, run: Run, gallery: int) -> None:
     """Write what *evaluate* leaves of one run: report.html, metrics.json, metrics.md and overview.png."""
     (folder / "report.html").write_text(page([run], limit=gallery), encoding="utf-8")
-    shown = worst_first([run.summary["per_scene"]], OVERVIEW_VIEWS)
-    if shown:
-        views = [run.images(scene["id"], view["index"]) for _, (scene,), (view,) in shown]
+    worst = worst_first([run.summary["per_scene"]], OVERVIEW_VIEWS)
+    if worst:
+        views = [run.images(scene["id"], view["index"]) for _, (scene,), (view,) in worst]
         (folder / "overview.png").write_bytes(png(overview(views, max(1, OVERVIEW_VIEW_PIXELS // len(views[0]["target"])))))
     (folder / "metrics.md").write_text(tables.markdown(run.summary), encoding="utf-8")
     (folder / "metrics.json").write_text(json.dumps(run.summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")

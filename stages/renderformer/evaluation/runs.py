@@ -75,7 +75,7 @@ def run_of(
         return {"target": view.image, "prediction": prediction, "direct": view.direct}
 
     upstream = {artifact.stage: artifact for artifact in (shard, train) if artifact is not None}
-    found = {stage: preimage["params"] for stage, preimage in history(upstream).items()} | {"evaluate": params}
+    params_by_stage = {stage: preimage["params"] for stage, preimage in history(upstream).items()} | {"evaluate": params}
     log = train.file("log.jsonl").read_text().splitlines() if train is not None else []
     scenes = [scene["id"] for scene in summary["per_scene"]]
     # Without the shards, that they were the same is told by their key.
@@ -86,7 +86,7 @@ def run_of(
         summary=summary,
         timing=timing,
         facts=facts(summary, evaluated.key),
-        configs={stage: _settings(found[stage]) for stage in CONFIGS if stage in found},
+        configs={stage: _settings(params_by_stage[stage]) for stage in CONFIGS if stage in params_by_stage},
         log=[json.loads(line) for line in log if line],
         images=images,
         targets={id: shard.row(id).digest if shard is not None else data for id in scenes},

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.atomic import write_atomic
 from pipeline.errors import UserError
 from pipeline.store import store_of
-from pipeline.store.files import write_atomic
 
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Store
@@ -43,14 +43,14 @@ def write_report(
     if not different_data:
         check_same(runs)
     page = report.page(runs, probes, gallery, title)
-    made = {
+    files = {
         out: page,
         out.with_suffix(".json"): json.dumps(tables.numbers(runs, probes), indent=1, allow_nan=False) + "\n",
         out.with_suffix(".md"): tables.side_by_side(runs, probes),
     }
-    for path, text in made.items():
+    for path, text in files.items():
         write_atomic(path, text.encode())
-    return list(made)
+    return list(files)
 
 
 def load(words: Sequence[str], store: Store) -> tuple[list[Run], list[Probe]]:
@@ -94,12 +94,12 @@ def check_same(runs: Sequence[Run]) -> None:
         first = runs[0]
         if run.targets != first.targets:
             shared = sum(run.targets.get(id) == target for id, target in first.targets.items())
-            said = [
+            names = [
                 f"{one.name} on {len(one.targets)} {data['split']} scenes of shard {data['key'][:12]}"
                 for one in (first, run)
                 for data in (one.summary["data"],)
             ]
             raise UserError(
-                f"the runs were evaluated on different scenes ({'; '.join(said)}; {shared} in common), so that their averages "
+                f"the runs were evaluated on different scenes ({'; '.join(names)}; {shared} in common), so that their averages "
                 "do not tell which is better: evaluate them on one dataset, or give --different-data to show them all the same"
             )

@@ -6,13 +6,14 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from stages.graphics.metrics import METRICS, Metric, named
+from stages.graphics.page.markdown import table
 from stages.graphics.statistics import BARS, JUDGED, METHODS, Estimate, decided, difference, with_interval
 from stages.renderformer.evaluation.runs import Probe, Run
 
 CEILING = "ceiling: noise of the ground truth"
 
 
-def told(metric: Metric, value: Estimate, sign: str = "") -> tuple[str, str]:
+def format_estimate(metric: Metric, value: Estimate, sign: str = "") -> tuple[str, str]:
     """Mean and its interval (``low to high``, "none: too few scenes"), as text."""
     if value["low"] is None:
         return metric.format(value["mean"], sign), "none: too few scenes"
@@ -27,23 +28,23 @@ def metrics_of(summaries: Collection[Mapping[str, Any]]) -> dict[str, Metric]:
 
 def verdicts(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """One sentence for each bar and judged metric, true or not; ``decided``: the interval leaves no doubt which."""
-    out = []
+    verdicts = []
     for bar in BARS:
         for name in JUDGED:
             gain, metric = summary["gains"][bar][name], METRICS[name]
-            mean, interval = told(metric, gain, "+")
+            mean, interval = format_estimate(metric, gain, "+")
             won = gain["mean"] > 0
             text = f"{'beats' if won else 'does not beat'} the {METHODS[bar]} in {metric.label}: gain "
             text += f"{mean} {metric.unit}".rstrip() + f" (95 % interval {interval})"
-            out.append({"won": won, "decided": decided(gain), "text": text})
-    return out
+            verdicts.append({"won": won, "decided": decided(gain), "text": text})
+    return verdicts
 
 
 def ceiling_lines(summary: Mapping[str, Any]) -> list[str]:
     """What the noise of the ground truth means for the scores, one sentence per metric that has a ceiling."""
     lines = []
     for name, ceiling in summary["ceiling"].items():
-        metric, (mean, interval) = METRICS[name], told(METRICS[name], ceiling)
+        metric, (mean, interval) = METRICS[name], format_estimate(METRICS[name], ceiling)
         text = f"{metric.label}: the noiseless truth would score " + f"{mean} {metric.unit}".rstrip()
         source = {"pairs": "rendered twice", "estimates": "by the renderer's own estimate"}[ceiling["from"]]
         text += f" (95 % interval {interval}; {ceiling['views']} views of {ceiling['of']}, {source})"
@@ -52,7 +53,7 @@ def ceiling_lines(summary: Mapping[str, Any]) -> list[str]:
 
 
 def noise_share(summary: Mapping[str, Any]) -> float | None:
-    """The noise's share of the model's squared error, told from mean PSNR and its ceiling; None where that is unknown."""
+    """The noise's share of the model's squared error, from mean PSNR and its ceiling; None where that is unknown."""
     if "psnr" not in summary["ceiling"]:
         return None
     return 10 ** ((summary["methods"]["model"]["psnr"]["mean"] - summary["ceiling"]["psnr"]["mean"]) / 10)
@@ -71,20 +72,20 @@ def columns(runs: Sequence[Run]) -> list[dict[str, Any]]:
     for method, label in [*METHODS.items(), ("ceiling", CEILING)]:
         if method == "model":
             continue
-        found: list[tuple[dict[str, Any], list[str]]] = []
+        distinct: list[tuple[dict[str, Any], list[str]]] = []  # values of the metrics, and the runs that have them
         for run in runs:
             values = run.summary["ceiling"] if method == "ceiling" else run.summary["methods"][method]
-            for other, names in found:
+            for other, names in distinct:
                 if all(other.get(name, value) == value for name, value in values.items()):
                     other |= values
                     names.append(run.name)
                     break
             else:
-                found.append((dict(values), [run.name]))
+                distinct.append((dict(values), [run.name]))
         kind = "bar" if method in BARS else method
-        for values, names in found:
-            of = "" if len(found) == 1 else f", {', '.join(names)}"
-            out.append({"label": label + of, "kind": kind, "values": values})
+        for values, names in distinct:
+            suffix = "" if len(distinct) == 1 else f", {', '.join(names)}"
+            out.append({"label": label + suffix, "kind": kind, "values": values})
     return out
 
 
@@ -112,7 +113,7 @@ def all_same(runs: Sequence[Run]) -> bool:
 def differences(runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
     """Name -> how much better that run is than the first (`statistics.difference`), over the scenes that all have in common."""
     same = same_scenes(runs)
-    found = {}
+    by_run = {}
     for run in runs[1:]:
         scenes = [other.summary["per_scene"] for other in (run, runs[0])]
         metrics = {
@@ -120,8 +121,8 @@ def differences(runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
             for name, metric in metrics_of([run.summary, runs[0].summary]).items()
             if all(name in other.summary["methods"]["model"] for other in (run, runs[0]))
         }
-        found[run.name] = difference(*scenes, same, metrics)
-    return {name: value for name, value in found.items() if value is not None}
+        by_run[run.name] = difference(*scenes, same, metrics)
+    return {name: value for name, value in by_run.items() if value is not None}
 
 
 def unlike(runs: Sequence[Run]) -> dict[str, list[str]]:
@@ -137,16 +138,13 @@ def markdown(summary: Mapping[str, Any]) -> str:
     metrics = metrics_of([summary])
     rows = columns([Run("model", "", summary)])
     best = best_of(rows, metrics)
-    lines = [
-        f"{summary['scenes']} scenes, {summary['views']} views; mean over views [95 % interval over scenes]",
-        "",
-        "| method | " + " | ".join(metric.heading for metric in metrics.values()) + " |",
-        "| --- |" + " ---: |" * len(metrics),
+    cells = [
+        [row["label"], *(_cell(metric, row["values"].get(name), best[name] == number) for name, metric in metrics.items())]
+        for number, row in enumerate(rows)
+        if row["values"]
     ]
-    for number, row in enumerate(rows):
-        if row["values"]:
-            cells = [_cell(metric, row["values"].get(name), best[name] == number) for name, metric in metrics.items()]
-            lines.append(f"| {row['label']} | " + " | ".join(cells) + " |")
+    lines = [f"{summary['scenes']} scenes, {summary['views']} views; mean over views [95 % interval over scenes]", ""]
+    lines += table(["method", *(metric.heading for metric in metrics.values())], cells, numeric=True)
     lines += ["", *(f"- The model {verdict['text']}." for verdict in verdicts(summary))]
     lines += [f"- Ceiling in {line}" for line in ceiling_lines(summary)] if summary["ceiling"] else []
     return "\n".join(lines) + "\n"
@@ -158,9 +156,8 @@ def _cell(metric: Metric, value: Estimate | None, bold: bool, sign: str = "") ->
     return with_interval(value, lambda number: metric.format(number, sign), bold)
 
 
-def _plain(cell: Any) -> str:
-    """A value of a probe's table as a Markdown cell."""
-    return "–" if cell is None else str(cell).replace("|", "\\|")
+def with_unit(metric: Metric) -> str:
+    return f"{metric.label} ({metric.unit})" if metric.unit else metric.label
 
 
 def side_by_side(runs: Sequence[Run], probes: Sequence[Probe]) -> str:
@@ -168,39 +165,40 @@ def side_by_side(runs: Sequence[Run], probes: Sequence[Probe]) -> str:
     lines = []
     if runs:
         metrics = metrics_of([run.summary for run in runs])
-        table = [column for column in columns(runs) if column["values"]]
-        best = best_of(table, metrics) if all_same(runs) else dict.fromkeys(metrics)
+        known = [column for column in columns(runs) if column["values"]]
+        best = best_of(known, metrics) if all_same(runs) else dict.fromkeys(metrics)
+        cells = [
+            [metric.heading, *(_cell(metric, column["values"].get(name), best[name] == i) for i, column in enumerate(known))]
+            for name, metric in metrics.items()
+        ]
         lines = ["Mean over views [95 % interval over scenes]", ""]
-        lines += ["| metric | " + " | ".join(column["label"] for column in table) + " |", "| --- |" + " ---: |" * len(table)]
-        for name, metric in metrics.items():
-            cells = [_cell(metric, column["values"].get(name), best[name] == i) for i, column in enumerate(table)]
-            lines.append(f"| {metric.heading} | " + " | ".join(cells) + " |")
-        found = differences(runs)
-        if found:
-            first = next(iter(found.values()))
+        lines += table(["metric", *(column["label"] for column in known)], cells, numeric=True)
+        by_run = differences(runs)
+        if by_run:
+            first = next(iter(by_run.values()))
             paired = f"paired over {first['views']} views of {first['scenes']} scenes"
             lines += ["", f"How much better than {runs[0].name}, {paired} (positive is better)", ""]
-            lines += ["| metric | " + " | ".join(found) + " |", "| --- |" + " ---: |" * len(found)]
-            for name, metric in metrics.items():
-                cells = [_cell(metric, row["gains"].get(name), False, "+") for row in found.values()]
-                lines.append(f"| {metric.label}{f' ({metric.unit})' if metric.unit else ''} | " + " | ".join(cells) + " |")
+            cells = [
+                [with_unit(metric), *(_cell(metric, row["gains"].get(name), False, "+") for row in by_run.values())]
+                for name, metric in metrics.items()
+            ]
+            lines += table(["metric", *by_run], cells, numeric=True)
     for probe in probes:
         facts = probe.facts
         lines += ["", f"### {facts['title']}", "", facts["question"], ""]
-        lines += ["| " + " | ".join(facts["columns"]) + " |", "| --- |" + " ---: |" * (len(facts["columns"]) - 1)]
-        lines += ["| " + " | ".join(_plain(cell) for cell in row) + " |" for row in facts["rows"]]
+        lines += table(facts["columns"], facts["rows"], numeric=True)
         lines += ["", *(f"- {note}" for note in facts["notes"])] if facts["notes"] else []
     return "\n".join(lines).strip() + "\n"
 
 
 def numbers(runs: Sequence[Run], probes: Sequence[Probe]) -> dict[str, Any]:
     """What the page says, as plain JSON; the scores of every view are in each run's own metrics.json."""
-    shown = [
+    rows = [
         {"name": run.name, "key": run.key, **{k: v for k, v in run.summary.items() if k != "per_scene"}, "timing": run.timing}
         for run in runs
     ]
     against = {"base": runs[0].name, "runs": differences(runs)} if len(runs) > 1 else None
-    return {"runs": shown, "differences": against, "probes": [{"key": probe.key, **probe.facts} for probe in probes]}
+    return {"runs": rows, "differences": against, "probes": [{"key": probe.key, **probe.facts} for probe in probes]}
 
 
 def flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:

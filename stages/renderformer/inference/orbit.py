@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pipeline.errors import UserError
 from stages.renderformer.records import SceneRecord
@@ -56,8 +57,7 @@ def centre(scene: SceneRecord, view: int) -> np.ndarray:
 
 def turned(pose: np.ndarray, pivot: np.ndarray, degrees: float) -> np.ndarray:
     """(4, 4) the pose turned about the vertical axis through the pivot."""
-    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    about_z = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    about_z = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     out = pose.copy()
     out[:3] = about_z @ pose[:3]
     out[:3, 3] += pivot - about_z @ pivot

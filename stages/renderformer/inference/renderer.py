@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.atomic import atomic_path
 from pipeline.errors import UserError
 from stages.renderformer.inference.predict import light_passes, predict_frames
 
@@ -275,9 +276,8 @@ def write_png(path: Path, picture: np.ndarray) -> None:
     """(H, W, 3) uint8 as a PNG file, which appears whole or not at all."""
     from PIL import Image
 
-    temporary = path.with_name(path.name + ".tmp")
     try:
-        Image.fromarray(picture).save(temporary, format="png")
-        temporary.replace(path)
+        with atomic_path(path) as temporary:
+            Image.fromarray(picture).save(temporary, format="png")
     except OSError as error:
         raise UserError(f"{path} cannot be written ({error}): give a file in an existing folder") from error

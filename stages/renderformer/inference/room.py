@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import Reject, UserError
+from stages.graphics.geometry.measure import face_normals
 from stages.graphics.geometry.records import MeshRecord, TextureRecord
 from stages.renderformer.records import SceneRecord
 from stages.renderformer.scenes import laws, meshes
@@ -210,7 +211,7 @@ def _turn_to(direction: np.ndarray) -> np.ndarray:
     """Degrees about x, y and z that turn the light triangle's normal to ``direction``."""
     from scipy.spatial.transform import Rotation
 
-    normal = meshes.face_normals(meshes.LIGHT_TRIANGLE[None])[0]
+    normal = face_normals(meshes.LIGHT_TRIANGLE[None])[0]
     axis = np.cross(normal, direction)
     angle = np.arctan2(np.linalg.norm(axis), normal @ direction)
     return Rotation.from_rotvec(axis * (angle / max(np.linalg.norm(axis), 1e-12))).as_euler("xyz", degrees=True)

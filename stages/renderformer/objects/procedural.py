@@ -11,6 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from stages.graphics.geometry.measure import normal_vectors
+
 Mesh = tuple[np.ndarray, np.ndarray]  # (V, 3) float64, (F, 3) int64, outward where closed
 
 TURN = 2 * np.pi
@@ -523,8 +525,7 @@ def box_coordinates(vertices: np.ndarray, faces: np.ndarray, repeats: float = 2.
     """
     corners = np.asarray(vertices, np.float64)[faces]
     corners = (corners - corners.min(axis=(0, 1))) * (repeats / max(float(np.ptp(corners, axis=(0, 1)).max()), 1e-12))
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    axis = np.abs(normal).argmax(axis=1)[:, None, None]
+    axis = np.abs(normal_vectors(corners)).argmax(axis=1)[:, None, None]
     first, second = (np.take_along_axis(corners, np.repeat((axis + step) % 3, 3, axis=1), axis=2)[..., 0] for step in (1, 2))
     return np.stack([first, second], axis=-1)
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from stages.graphics.geometry.measure import face_normals
 from stages.renderformer.records import SceneRecord, patch_means
 from stages.renderformer.scenes import meshes
 from stages.renderformer.scenes.assemble import place, rotation_matrix
@@ -70,7 +71,7 @@ def with_lights(scene: SceneRecord, triangles: np.ndarray, radiance: np.ndarray,
     count = len(triangles)
     lights = {
         "triangles": triangles,
-        "vertex_normals": np.repeat(meshes.face_normals(triangles.astype(np.float64))[:, None], 3, axis=1),
+        "vertex_normals": np.repeat(face_normals(triangles.astype(np.float64))[:, None], 3, axis=1),
         "diffuse": np.ones((count, 3)),  # as the released format has it; nothing reflects from a light
         "specular": np.zeros((count, 3)),
         "roughness": np.ones(count),

@@ -9,7 +9,6 @@ network reads the arrays, encodes and decodes.
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -40,36 +39,12 @@ if TYPE_CHECKING:
     from pipeline.store import Draft
 
 
-def seconds(work: Callable[[], Any], repeats: int) -> float:
-    """Wall time of the fastest of ``repeats`` calls after one that warms up: what others do on the machine only adds."""
-    taken = []
-    for _ in range(repeats + 1):
-        start = time.perf_counter()
-        work()
-        taken.append(time.perf_counter() - start)
-    return min(taken[1:])
-
-
 def use_threads(threads: int | None) -> int:
     """Let the network use so many CPU threads (None: all cores), in this process from here on."""
     import torch
 
     torch.set_num_threads(threads or os.cpu_count() or 1)
     return torch.get_num_threads()
-
-
-def synchronised(worker: Worker, work: Callable[[], Any]) -> Callable[[], Any]:
-    """The work and the wait for a GPU to have done it."""
-
-    def waited() -> Any:
-        import torch
-
-        found = work()
-        if worker.device == "cuda":
-            torch.cuda.synchronize()
-        return found
-
-    return waited
 
 
 def traced_picture(worker: Worker, scene: SceneRecord, spp: int, denoised: bool, **options: Any) -> np.ndarray:
@@ -82,9 +57,9 @@ def traced_picture(worker: Worker, scene: SceneRecord, spp: int, denoised: bool,
 
 def machine(worker: Worker, threads: int) -> str:
     """Where times were taken, and whether the machine had other things to do."""
-    told = f"network on {worker.device} with {threads} thread(s), path tracer on {worker.renderer['backend']}"
+    text = f"network on {worker.device} with {threads} thread(s), path tracer on {worker.renderer['backend']}"
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
-    return told + (f" (the machine was busy, load {load:.1f} on {cores} cores: times too long)" if load > 1.5 * cores else "")
+    return text + (f" (the machine was busy, load {load:.1f} on {cores} cores: times too long)" if load > 1.5 * cores else "")
 
 
 # --- time by stage ----------------------------------------------------------------------------------------------------
@@ -141,9 +116,9 @@ class Timing(Probe):
         measured: dict[int, list[dict[str, float]]] = {}
         for row in draft.rows():
             facts = unpack_json(draft.read(row.id, ("metrics.json",)).members["metrics.json"])
-            found = self._times(worker, self._scene(worker, row.id)) | {k: v / 1e9 for k, v in facts["flops"].items()}
-            measured.setdefault(facts["triangles"], []).append(found)
-        means = {n: {k: float(np.mean([m[k] for m in found])) for k in found[0]} for n, found in sorted(measured.items())}
+            gflops = {name: flops / 1e9 for name, flops in facts["flops"].items()}
+            measured.setdefault(facts["triangles"], []).append(self._times(worker, self._scene(worker, row.id)) | gflops)
+        means = {n: {k: float(np.mean([m[k] for m in rows])) for k in rows[0]} for n, rows in sorted(measured.items())}
         columns = ["triangles", "view-independent (s)", "view-dependent (s)", "one picture (s)"]
         columns += [f"each of {config.frames} frames (s)", "GFLOP, view-independent", "GFLOP, view-dependent"]
         columns += [f"path tracer, {config.tracer_spp} samples, denoised (s)"] if config.tracer_spp else []
@@ -185,25 +160,34 @@ class Timing(Probe):
 
     def _times(self, worker: Worker, scene: SceneRecord) -> dict[str, float]:
         """Seconds of the network's stages and of the path tracer on one scene."""
-        import torch
-
+        from model.renderformer.timing import time_steps
+        from model.timing import fastest
         from stages.renderformer.inference.predict import predict_scene
 
         config, model = worker.config, worker.model.eval()
         batch = {name: array[None] for name, array in scene.arrays().items() if name not in ("patches", "patch_index")}
         batch["mask"] = np.ones((1, len(scene.triangles)), bool)
-        poses, fov = (torch.from_numpy(a).to(worker.device)[None] for a in (scene.camera_to_world, scene.fov_deg))
-        with torch.inference_mode():
-            tokens = model.encode(model.read(batch, worker.device))
-            encode = seconds(synchronised(worker, lambda: model.encode(model.read(batch, worker.device))), config.repeats)
-            decode = seconds(synchronised(worker, lambda: model.decode(tokens, poses, fov, config.resolution)), config.repeats)
-        total = seconds(lambda: predict_scene(model, scene, [0], config.resolution, worker.device), config.repeats)
-        views = [0] * config.frames
-        frames = seconds(lambda: predict_scene(model, scene, views, config.resolution, worker.device), config.repeats)
-        found = {"encode": encode, "decode": decode, "total": total, "frame": frames / config.frames}
+        batch |= {"camera_to_world": scene.camera_to_world[None], "fov_deg": scene.fov_deg[None]}
+        steps = time_steps(model, batch, config.resolution, worker.device, config.repeats)
+
+        def predicted(views: int) -> float:
+            return fastest(
+                lambda: predict_scene(model, scene, [0] * views, config.resolution, worker.device),
+                worker.device,
+                config.repeats,
+            )
+
+        times = {
+            "encode": steps["read"] + steps["encode"],
+            "decode": steps["project"] + steps["rays"] + steps["head"],
+            "total": predicted(1),
+            "frame": predicted(config.frames) / config.frames,
+        }
         if config.tracer_spp:
-            found["trace"] = seconds(lambda: traced_picture(worker, scene, config.tracer_spp, denoised=True), config.repeats)
-        return found
+            times["trace"] = fastest(
+                lambda: traced_picture(worker, scene, config.tracer_spp, denoised=True), "cpu", config.repeats
+            )
+        return times
 
 
 # --- equal time -------------------------------------------------------------------------------------------------------
@@ -263,6 +247,7 @@ class EqualTime(Probe):
         yield Record(item.id, {"metrics.json": pack_json(facts), **members})
 
     def finish(self, worker: Worker, draft: Draft) -> Outcome:
+        from model.timing import fastest
         from stages.graphics.exr import decode_rgb
         from stages.graphics.statistics import bootstrap
         from stages.renderformer.probes.figures import COLOURS, LEAST_WIDTH, new_figure, plain, strip
@@ -272,9 +257,9 @@ class EqualTime(Probe):
         ids = [row.id for row in draft.rows()]
         facts = [unpack_json(draft.read(id, ("metrics.json",)).members["metrics.json"]) for id in ids]
         scene = worker.base(ids[0])
-        model_s = seconds(synchronised(worker, lambda: worker.predict(scene)), config.repeats)
+        model_s = fastest(lambda: worker.predict(scene), worker.device, config.repeats)
         traced_s = {
-            (method, spp): seconds(lambda spp=spp, d=denoise: self._traced(worker, scene, spp, d), config.repeats)
+            (method, spp): fastest(lambda spp=spp, d=denoise: self._traced(worker, scene, spp, d), "cpu", config.repeats)
             for method, denoise in TRACED.items()
             for spp in config.values
         }

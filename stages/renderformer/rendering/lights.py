@@ -6,8 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from stages.graphics.geometry.measure import normal_vectors
 from stages.renderformer.records import SceneRecord
-from stages.renderformer.rendering.surfaces import face_normals, gatherable
+from stages.renderformer.rendering.surfaces import gatherable
 
 SLOTS = 8  # lights per pass; more lights take several passes of the same kernel
 OTHER = SLOTS  # slot of a light that belongs to another pass: hidden like any light, black here
@@ -36,7 +37,7 @@ class LightTable:
         mine = (index >= first) & (index < first + SLOTS)
         slot = np.where(mine, index - first, np.where(index >= 0, OTHER, -1))
         emission = np.where(mine[:, None], scene.emission, 0).astype(np.float32)
-        cross = face_normals(scene.triangles)
+        cross = normal_vectors(scene.triangles.astype(np.float64))
         length = np.linalg.norm(cross, axis=1)
         power = emission.sum(axis=1, dtype=np.float64) * length
         chosen = np.nonzero(power > 0)[0]  # lights without power get no samples

@@ -12,9 +12,10 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from stages.graphics.geometry.measure import normal_vectors
 from stages.renderformer.records import SceneRecord
 from stages.renderformer.rendering.sums import Sums
-from stages.renderformer.rendering.surfaces import face_normals, mesh_of, surface_mesh
+from stages.renderformer.rendering.surfaces import mesh_of, surface_mesh
 
 MIN_SPP = 1  # per light
 GAP = 1e-5  # distance of a light's side from its true plane, over the largest coordinate of the light
@@ -164,7 +165,7 @@ def perspective(scene: SceneRecord, view: int, resolution: int) -> mi.Sensor:
 
 def _emitter_mesh(triangles: np.ndarray, radiance: np.ndarray, content: np.ndarray) -> tuple[mi.Mesh, float]:
     """One side of a light, and how often to sample it: by power and by how much of the content it faces."""
-    cross = face_normals(triangles)
+    cross = normal_vectors(triangles.astype(np.float64))
     length = np.linalg.norm(cross, axis=1)
     normal = cross / np.maximum(length, 1e-30)[:, None]
     shift = GAP * max(float(np.abs(triangles).max()), 1.0)

@@ -30,12 +30,6 @@ TILE = PATCH_SIDE + 2  # texels of a textured triangle's tile per side
 SMALL_TILE = 2  # of a constant triangle's
 
 
-def face_normals(triangles: np.ndarray) -> np.ndarray:
-    """(F, 3) geometric normals of (F, 3, 3) triangles, their length twice the area."""
-    edges = triangles[:, 1:].astype(np.float64) - triangles[:, :1]
-    return np.cross(edges[:, 0], edges[:, 1])
-
-
 class Surfaces:
     """What the renderer knows of the triangles ``faces`` (indices) of a scene: their parameters and where their patches lie.
 

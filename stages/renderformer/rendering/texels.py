@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
+from stages.graphics.geometry.measure import normal_vectors
 from stages.renderformer.records import PATCH_CHANNELS, PATCH_SIDE, SceneRecord
 from stages.renderformer.rendering import backend as backends
 
@@ -41,7 +42,6 @@ def texel_radiance(
     covers within ``HEIGHT`` is not. It is diffuse reflectance / pi times irradiance; needs a JIT backend.
     """
     from stages.renderformer.rendering.jit import JitRenderer, Limits
-    from stages.renderformer.rendering.surfaces import face_normals
 
     backends.activate(backend)
     if backend["backend"] == "scalar":
@@ -49,7 +49,7 @@ def texel_radiance(
     faces = np.asarray(triangles, np.int64)
     kept, weights = texel_weights(size)
     corners = scene.triangles[faces].astype(np.float64)
-    cross = face_normals(corners)
+    cross = normal_vectors(corners)
     normals = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
     points = (weights @ corners).reshape(-1, 3)
     renderer = JitRenderer(scene, 1, seed, Limits(33), lights_visible=True)

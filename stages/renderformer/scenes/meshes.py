@@ -6,6 +6,8 @@ from functools import cache
 
 import numpy as np
 
+from stages.graphics.geometry.measure import face_normals, normal_vectors
+
 Mesh = tuple[np.ndarray, np.ndarray]  # vertices (V, 3) float64, faces (F, 3) int64
 
 LIGHT_TRIANGLE = 0.025 * np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])  # edge 0.0707, area 0.0022
@@ -20,8 +22,7 @@ def _grid(rows: int, columns: int) -> np.ndarray:
 
 def areas(triangles: np.ndarray) -> np.ndarray:
     """(F,) areas of (F, 3, 3) triangles."""
-    edges = triangles[:, 1:].astype(np.float64) - triangles[:, :1]
-    return 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    return 0.5 * np.linalg.norm(normal_vectors(triangles.astype(np.float64)), axis=1)
 
 
 @cache
@@ -100,13 +101,6 @@ def special_rungs(shape: str) -> dict[str, int]:
     """Resolution -> number of faces, up to 4,192."""
     sizes = {str(n): len(special(shape, n)[1]) for n in range(1, 19)}
     return {n: faces for n, faces in sizes.items() if faces <= 4192}
-
-
-def face_normals(triangles: np.ndarray) -> np.ndarray:
-    """(F, 3) unit normals of (F, 3, 3) triangles; +z for those without area."""
-    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return np.where(length > 0, normal / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
 
 
 def shading_groups(vertices: np.ndarray, faces: np.ndarray, crease_deg: float) -> np.ndarray:

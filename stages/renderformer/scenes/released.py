@@ -21,7 +21,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import Reject, UserError
+from stages.graphics.geometry.measure import face_normals
 from stages.renderformer.records import PATCH_CHANNELS, PATCH_KEPT, PATCH_SIDE, TEXTURED_CHANNELS, SceneRecord, patch_means
+from stages.renderformer.scenes.assemble import rotation_matrix
 
 CREASE_DEG = 30.0
 MIN_ROUGHNESS = 0.01
@@ -164,7 +166,7 @@ def _mesh(folder: Path, entry: dict[str, Any], smooth: bool, where: str) -> tupl
     if transform.get("normalize"):
         vertices = vertices - vertices.mean(axis=0)
         vertices *= 0.5 / max(np.linalg.norm(vertices, axis=1).max(), 1e-12)
-    rotation = _rotation(_numbers(transform, "rotation", (0, 0, 0), where))
+    rotation = rotation_matrix(_numbers(transform, "rotation", (0, 0, 0), where))
     scale = _scale(transform, where)
     vertices = vertices @ rotation.T * scale + _numbers(transform, "translation", (0, 0, 0), where)
 
@@ -176,10 +178,7 @@ def _mesh(folder: Path, entry: dict[str, Any], smooth: bool, where: str) -> tupl
         groups = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
         normals = np.array(mesh.vertex_normals[mesh.faces])
     triangles = mesh.vertices[mesh.faces]
-    flat = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    length = np.linalg.norm(flat, axis=1, keepdims=True)
-    flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
-    flat = np.repeat(flat[:, None], 3, axis=1)
+    flat = np.repeat(face_normals(triangles)[:, None], 3, axis=1)
     if not smooth:
         return triangles, flat, groups
     length = np.linalg.norm(normals, axis=2, keepdims=True)
@@ -228,15 +227,6 @@ def _scale(transform: dict[str, Any], where: str) -> np.ndarray:
     value = transform.get("scale", 1.0)
     default = 1.0 if np.ndim(value) == 0 else (1.0, 1.0, 1.0)
     return np.broadcast_to(_numbers(transform, "scale", default, where), 3)
-
-
-def _rotation(degrees: np.ndarray) -> np.ndarray:
-    """Rotation matrix about x, then y, then z, by angles in degrees."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
 
 
 def _diffuse(material: dict[str, Any], groups: np.ndarray, where: str) -> np.ndarray:
