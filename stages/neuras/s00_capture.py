@@ -103,7 +103,7 @@ class Capture(MapStage):
 
 def _source(config: StageConfig, folder: Path | None = None) -> Any:
     """The source that the config names; ``folder``: what its ``prepare`` wrote."""
-    from stages.neuras.captures import nerfstudio
+    from stages.neuras.captures import colmap, nerfstudio, pandaset
 
-    readers = {"nerfstudio": nerfstudio.read}
+    readers = {"nerfstudio": nerfstudio.read, "colmap": colmap.read, "pandaset": pandaset.read}
     return FolderSource(config, readers[config.name])

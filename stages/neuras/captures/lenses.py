@@ -7,6 +7,7 @@ nerfstudio. Pixels are measured from the image's upper left corner, centres at +
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -60,6 +61,7 @@ class Lens:
             axis=-1,
         )
 
+    @lru_cache(maxsize=4)  # most captures have one lens
     def sources(self) -> tuple[np.ndarray, np.ndarray]:
         """Where each pixel of the undistorted image lies in the real one: (H, W, 2) pixels, and (H, W) bool: in it.
 

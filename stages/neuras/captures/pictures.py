@@ -56,6 +56,15 @@ def made(image_file: Path, mask_file: Path | None, lens: Lens, max_side: int | N
     return Picture(_png(picture), drawn and _png(drawn), size)
 
 
+def size_of(path: Path) -> tuple[int, int]:
+    """(width, height) that the image file states; raises Reject."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except Exception as error:  # decoders of strangers' files fail in every way
+        raise Reject("unreadable", f"the image {path.name}: {type(error).__name__}: {str(error)[:150]}") from None
+
+
 def _fitting(size: tuple[int, int], max_side: int | None) -> tuple[int, int]:
     if max_side is None or max(size) <= max_side:
         return size
