@@ -21,6 +21,7 @@ FILE = "transforms.json"
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 LISTS = {"train_filenames": "train", "val_filenames": "validation", "test_filenames": "test"}
 POINTS = "sparse_pc.ply"
+TERMS = ("k1", "k2", "k3", "k4", "p1", "p2")  # of the distortion
 
 
 def read(config: FolderConfig, root: Path) -> Inventory:
@@ -51,6 +52,8 @@ def read(config: FolderConfig, root: Path) -> Inventory:
     shots = [shot(frame) for frame in frames]
     if named:
         shots = [shot for shot in shots if shot.split is not None]  # the set leaves the others out
+        if frames and not shots:
+            raise UserError(f"{path}: {', '.join(LISTS)} name none of its frames: they must repeat a frame's file_path")
     units, units_from = _units(told)
     sets = _points(config, root, told)
     return Inventory(shots, sets, "sfm" if sets else "none", units, units_from, _up(told))
@@ -71,7 +74,7 @@ def _lens(told: dict[str, Any]) -> Lens:
     if missing:
         raise Reject("no_intrinsics", f"{', '.join(missing)} not given, neither by the file nor by the frame")
     try:
-        value = {name: float(told[name]) for name in ("fl_x", "fl_y", "cx", "cy", *_TERMS) if told.get(name) is not None}
+        value = {name: float(told[name]) for name in ("fl_x", "fl_y", "cx", "cy", *TERMS) if told.get(name) is not None}
         width, height = int(told["w"]), int(told["h"])
     except (TypeError, ValueError, OverflowError):
         raise Reject("no_intrinsics", "an intrinsic is not a number") from None
@@ -86,14 +89,14 @@ def _lens(told: dict[str, Any]) -> Lens:
     return lens
 
 
-_TERMS = ("k1", "k2", "k3", "k4", "p1", "p2")
-
-
 def _named(told: dict[str, Any]) -> dict[str, Any]:
     """Split by file name, of the lists that nerfstudio calls so; {} where there are none."""
     found: dict[str, Any] = {}
     for key, split in LISTS.items():
-        for name in told.get(key) or []:
+        names = told.get(key) or []
+        if not isinstance(names, list):
+            raise UserError(f"{FILE}: {key} is not a list of file names")
+        for name in names:
             found[Path(str(name)).as_posix()] = split
     return found
 

@@ -7,12 +7,14 @@ numbers), timestamps and numbered JPEGs; ``lidar/`` a sweep per frame as a pickl
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.errors import Reject, UserError
+from stages.graphics.geometry.paths import inside
 from stages.neuras.captures import pickles, poses
 from stages.neuras.captures.lenses import Lens
 from stages.neuras.captures.pictures import size_of
@@ -33,8 +35,8 @@ def _shots(root: Path, camera: str) -> list[Shot]:
         raise UserError(f"capture.cameras: {str(root)!r} has no camera {camera!r}; it has {', '.join(known) or 'none'}")
     placed, intrinsics = _json(folder / "poses.json", list), _json(folder / "intrinsics.json", dict)
     times = _json(folder / "timestamps.json", list)
-    if len(times) != len(placed):
-        raise UserError(f"{folder}: {len(placed)} poses and {len(times)} timestamps")
+    if len(times) != len(placed) or not all(isinstance(time, (int, float)) for time in times):
+        raise UserError(f"{folder}: timestamps.json must hold a number for each of the {len(placed)} poses, and has {len(times)}")
     shots = []
     for index, (pose, time) in enumerate(zip(placed, times, strict=True)):
         def fill(shot: Shot, index: int = index, pose: Any = pose) -> None:
@@ -54,21 +56,22 @@ def _sweeps(root: Path) -> list[PointSet]:
     if not (folder / "poses.json").is_file():
         return []
     sensors = _json(folder / "poses.json", list)
-    files = ((index, folder / f"{index:02d}.pkl.gz") for index in range(len(sensors)))
-    return [
-        PointSet(f"{index:02d}", path, lambda path=path, pose=sensors[index]: (_sweep(path), np.array(_pose(pose)[0], np.float32)), index)
-        for index, path in files
-        if path.is_file() and path.resolve().is_relative_to(root.resolve())
-    ]
+    sets = []
+    for index, pose in enumerate(sensors):
+        path = folder / f"{index:02d}.pkl.gz"
+        if path.is_file() and inside(path, root):  # some sequences lack a sweep
+            sets.append(PointSet(f"{index:02d}", path, partial(_sweep, path, pose), index))
+    return sets
 
 
-def _sweep(path: Path) -> np.ndarray:
-    """(P, 3) float32, world."""
+def _sweep(path: Path, pose: Any) -> tuple[np.ndarray, np.ndarray]:
+    """(P, 3) float32 points and (3,) the sensor, world; raises Reject."""
+    sensor = np.array(_pose(pose)[0], np.float32)
     columns = pickles.table(path)
     missing = [name for name in "xyz" if name not in columns]
     if missing:
         raise Reject("unreadable", f"{path.name} has no column {', '.join(missing)}")
-    return np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float32)
+    return np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float32), sensor
 
 
 def _pose(told: Any) -> tuple[list[float], list[float]]:

@@ -25,7 +25,8 @@ def drawn(views: Sequence[FrameRecord], points: Sequence[np.ndarray], mesh: Mesh
     from matplotlib import pyplot
 
     chosen = [views[index] for index in np.unique(np.linspace(0, len(views) - 1, min(SHOWN, len(views))).round().astype(int))]
-    rows, columns = -(-len(chosen) // 4), 4
+    columns = min(max(round(np.sqrt(len(chosen) / 1.3)), 1), 4)
+    rows = -(-len(chosen) // columns)
     figure = pyplot.figure(figsize=(15, max(1.35 * rows, 5.4)), dpi=100, layout="constrained")
     left, right = figure.subfigures(1, 2, width_ratios=(1.25, 1))
     axes = left.subplots(rows, columns, squeeze=False).ravel()

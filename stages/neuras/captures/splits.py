@@ -38,7 +38,7 @@ def assigned(moments: Sequence[Hashable], named: Sequence[Split | None], rule: R
     else:
         order = list(dict.fromkeys(moments))
         if rule == "random_half":
-            chosen = np.random.default_rng(seed_for(seed, "capture.split")).permutation(len(order))[: len(order) // 2]
+            chosen = np.random.default_rng(seed_for(seed, "capture", "split")).permutation(len(order))[: len(order) // 2]
             test = {order[index] for index in chosen}
             said = f"a random half is test (seed {seed})"
         else:
@@ -49,5 +49,6 @@ def assigned(moments: Sequence[Hashable], named: Sequence[Split | None], rule: R
         return splits, said + ", and so is validation"
     training = list(dict.fromkeys(moment for moment, split in zip(moments, splits, strict=True) if split == "train"))
     chosen = set(training[VALIDATION_EVERY // 2 :: VALIDATION_EVERY])
-    splits = ["validation" if split == "train" and moment in chosen else split for moment, split in zip(moments, splits, strict=True)]
+    pairs = zip(moments, splits, strict=True)
+    splits = ["validation" if split == "train" and moment in chosen else split for moment, split in pairs]
     return splits, said + ", every fifth training frame is validation"
