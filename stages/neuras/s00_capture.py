@@ -94,6 +94,11 @@ class Capture(MapStage):
             save(draft.files / "mesh.npz", mesh)
         views, points = list(frames(draft)), [record.points for record in point_sets(draft)]
         (draft.files / "contact.png").write_bytes(sheet.drawn(views, points, mesh, info))
+        if info.units == "arbitrary":
+            draft.log(
+                f"unit unknown ({info.source['units_from']}): a hundredth of the capture's radius, {info.metre:.4g}, stands for a "
+                "metre. Where the set is in metres: capture.units=metre"
+            )
         draft.note("summary", sheet.summary(views, points, mesh, info))
 
     def check(self, draft: Draft) -> None:

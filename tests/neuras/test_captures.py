@@ -155,7 +155,8 @@ def pandaset(root: Path, count: int = 6, camera: str = "front_camera") -> Path:
         placed.append({"position": position, "heading": {"w": w, "x": x, "y": y, "z": z}})
         sweep = old_frame({name: np.array([POINT[axis], number]) for axis, name in enumerate("xyz")})
         (lidar / f"{number:02d}.pkl.gz").write_bytes(gzip.compress(sweep))
-    sensors = [{"position": {"x": number, "y": 2, "z": 3}, "heading": {"w": 1, "x": 0, "y": 0, "z": 0}} for number in range(count)]
+    level = {"w": 1, "x": 0, "y": 0, "z": 0}
+    sensors = [{"position": {"x": number, "y": 2, "z": 3}, "heading": level} for number in range(count)]
     (folder / "poses.json").write_text(json.dumps(placed))
     (lidar / "poses.json").write_text(json.dumps(sensors))
     (folder / "timestamps.json").write_text(json.dumps([100 + 0.1 * number for number in range(count)]))

@@ -7,8 +7,9 @@ fail in another way than by a UserError: every count is checked against the byte
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from pipeline.errors import Reject, UserError
 from stages.neuras.captures import poses
 from stages.neuras.captures.lenses import Lens
-from stages.neuras.captures.sources import FolderConfig, Inventory, PointSet, Shot, file_in, shot_of
+from stages.neuras.captures.sources import Inventory, PointSet, Shot, file_in, shot_of
 
 # name, in the order of the binary format's numbers -> number of parameters; those that are read have a lens below
 MODELS = {
@@ -45,21 +46,21 @@ def read(config: Any, root: Path) -> Inventory:
     lenses = cameras(folder)
     shots = []
     for image in sorted(images(folder), key=lambda image: image.name):
-        def fill(shot: Shot, image: PosedImage = image) -> None:
-            if image.camera not in lenses:
-                raise Reject("no_intrinsics", f"the model has no camera {image.camera}")
-            shot.lens = lenses[image.camera]
-            if shot.lens.wrong():
-                raise Reject("no_intrinsics", shot.lens.wrong())
-            shot.camera_to_world = camera_to_world(image)
-            shot.image = file_in(root, f"{config.images}/{image.name}" if config.images else image.name, "image")
-
-        shot = shot_of(image.name, fill)
+        named = f"{config.images}/{image.name}" if config.images else image.name
+        shot = shot_of(image.name, partial(_fill, image, lenses.get(image.camera), partial(file_in, root, named, "image")))
         shot.moment = image.name
         shots.append(shot)
     found = _file(folder, "points3D")
     sets = [] if found is None else [PointSet("sfm", found, lambda: (points(folder, config.max_bytes)[1], None))]
     return Inventory(shots, sets, "sfm" if sets else "none", units_from="COLMAP's models have no unit")
+
+
+def _fill(image: PosedImage, lens: Lens | None, find: Callable[[], Path], shot: Shot) -> None:
+    if lens is None:
+        raise Reject("no_intrinsics", f"the model has no camera {image.camera}")
+    if lens.wrong():
+        raise Reject("no_intrinsics", lens.wrong())
+    shot.lens, shot.camera_to_world, shot.image = lens, camera_to_world(image), find()
 
 
 def model_folder(model: str | None, root: Path) -> Path:

@@ -51,7 +51,7 @@ class Lens:
         """(.., 2) of the real image plane (at distance 1) from (.., 2) of the ideal one."""
         x, y = points[..., 0], points[..., 1]
         square = x * x + y * y
-        scale = self._radial(square)
+        scale = self.radial_scale(square)
         p1, p2 = self.tangential
         return np.stack(
             [
@@ -61,34 +61,37 @@ class Lens:
             axis=-1,
         )
 
-    @lru_cache(maxsize=4)  # most captures have one lens
-    def sources(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where each pixel of the undistorted image lies in the real one: (H, W, 2) pixels, and (H, W) bool: in it.
-
-        A polynomial folds back beyond some radius; what lies there is not in the image.
-        """
-        focal, centre = np.array([self.fx, self.fy]), np.array([self.cx, self.cy])
-        ideal = (self.camera(np.eye(4)).pixel_centres() - centre) / focal
-        pixels = self.distort(ideal) * focal + centre
-        inside = ((pixels >= 0) & (pixels <= [self.width, self.height])).all(axis=-1)
-        radius = np.linalg.norm(ideal, axis=-1)
-        return pixels, inside & (radius < self._fold(float(radius.max())))
-
-    def _radial(self, square: np.ndarray) -> np.ndarray:
+    def radial_scale(self, square: np.ndarray) -> np.ndarray:
+        """How much farther out a point lies in the image, from its squared radius on the ideal plane."""
         k1, k2, k3, k4, k5, k6 = (*self.radial, *(0.0,) * 6)[:6]
         return (1 + square * (k1 + square * (k2 + square * k3))) / (1 + square * (k4 + square * (k5 + square * k6)))
 
-    def _fold(self, farthest: float) -> float:
-        """The radius on the ideal plane up to which a larger one is a larger one in the image too."""
-        radius = np.linspace(0, farthest * 1.001 + 1e-9, 2000)
-        turns = np.flatnonzero(np.diff(radius * self._radial(radius * radius)) <= 0)
-        return float(radius[turns[0]]) if len(turns) else np.inf
+
+@lru_cache(maxsize=4)  # most captures have one lens
+def sources(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """Where each pixel of the undistorted image lies in the real one: (H, W, 2) pixels, and (H, W) bool: in it.
+
+    A polynomial folds back beyond some radius; what lies there is not in the image.
+    """
+    focal, centre = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
+    ideal = (lens.camera(np.eye(4)).pixel_centres() - centre) / focal
+    pixels = lens.distort(ideal) * focal + centre
+    inside = ((pixels >= 0) & (pixels <= [lens.width, lens.height])).all(axis=-1)
+    radius = np.linalg.norm(ideal, axis=-1)
+    return pixels, inside & (radius < _fold(lens, float(radius.max())))
+
+
+def _fold(lens: Lens, farthest: float) -> float:
+    """The radius on the ideal plane up to which a larger one is a larger one in the image too."""
+    radius = np.linspace(0, farthest * 1.001 + 1e-9, 2000)
+    turns = np.flatnonzero(np.diff(radius * lens.radial_scale(radius * radius)) <= 0)
+    return float(radius[turns[0]]) if len(turns) else np.inf
 
 
 def undistorted(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """The image (H, W, 3) uint8 through the lens's pinhole, and (H, W) bool: which of its pixels the real image has."""
-    pixels, inside = lens.sources()
-    return np.clip(np.rint(bilinear(image, pixels)), 0, 255).astype(np.uint8), inside
+    pixels, inside = sources(lens)
+    return np.clip(np.rint(bilinear(image, pixels)), 0, 255).astype(np.uint8), inside.copy()
 
 
 def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:

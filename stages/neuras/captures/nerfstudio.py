@@ -37,7 +37,7 @@ def read(config: FolderConfig, root: Path) -> Inventory:
         raise UserError(f"{path} is not nerfstudio's layout: it needs a list 'frames' ({error})") from None
     model = told.get("camera_model", "OPENCV")
     if model not in MODELS:
-        raise UserError(f"{path}: camera_model {model!r} is not read; undistort the images to a pinhole, or use {', '.join(MODELS)}")
+        raise UserError(f"{path}: camera_model {model!r} is not read ({', '.join(MODELS)} are): undistort the images first")
     named = _named(told)
     frames = sorted(frames, key=lambda frame: (_time(frame) or 0.0, str(frame.get("file_path", ""))))
     timed = all(_time(frame) is not None for frame in frames)

@@ -36,19 +36,20 @@ def _shots(root: Path, camera: str) -> list[Shot]:
     placed, intrinsics = _json(folder / "poses.json", list), _json(folder / "intrinsics.json", dict)
     times = _json(folder / "timestamps.json", list)
     if len(times) != len(placed) or not all(isinstance(time, (int, float)) for time in times):
-        raise UserError(f"{folder}: timestamps.json must hold a number for each of the {len(placed)} poses, and has {len(times)}")
+        raise UserError(f"{folder}: timestamps.json must hold one number for each of the {len(placed)} poses")
     shots = []
     for index, (pose, time) in enumerate(zip(placed, times, strict=True)):
-        def fill(shot: Shot, index: int = index, pose: Any = pose) -> None:
-            position, heading = _pose(pose)
-            shot.camera_to_world = poses.from_opencv(poses.rotation_of(heading), position)
-            shot.image = file_in(root, shot.name, "image")
-            shot.lens = _lens(intrinsics, *size_of(shot.image))
-
-        shot = shot_of(f"camera/{camera}/{index:02d}.jpg", fill)
+        shot = shot_of(f"camera/{camera}/{index:02d}.jpg", partial(_fill, root, pose, intrinsics))
         shot.moment, shot.time, shot.meta = index, float(time), {"camera": camera}
         shots.append(shot)
     return shots
+
+
+def _fill(root: Path, pose: Any, intrinsics: dict[str, Any], shot: Shot) -> None:
+    position, heading = _pose(pose)
+    shot.camera_to_world = poses.from_opencv(poses.rotation_of(heading), position)
+    shot.image = file_in(root, shot.name, "image")
+    shot.lens = _lens(intrinsics, *size_of(shot.image))
 
 
 def _sweeps(root: Path) -> list[PointSet]:

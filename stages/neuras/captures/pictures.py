@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from pipeline.errors import Reject
-from stages.neuras.captures.lenses import Lens, bilinear, undistorted
+from stages.neuras.captures.lenses import Lens, bilinear, sources, undistorted
 
 MODES = ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "YCbCr")  # 8 bits a channel
 
@@ -45,7 +45,7 @@ def made(image_file: Path, mask_file: Path | None, lens: Lens, max_side: int | N
     if not lens.straight:
         pixels, inside = undistorted(pixels, lens)
         if mask is not None:
-            inside &= bilinear(mask[..., None], lens.sources()[0])[..., 0] > 0.999
+            inside &= bilinear(mask[..., None], sources(lens)[0])[..., 0] > 0.999
         mask = None if inside.all() else inside
     picture = Image.fromarray(pixels)
     drawn = None if mask is None else _drawn(mask)

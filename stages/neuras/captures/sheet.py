@@ -17,7 +17,7 @@ SHOWN = 20  # pictures
 DOTS = 60_000
 
 
-def drawn(views: Sequence[FrameRecord], points: Sequence[np.ndarray], mesh: Mesh | None, info: CaptureInfo) -> bytes:
+def drawn(views: Sequence[FrameRecord], points: list[np.ndarray], mesh: Mesh | None, info: CaptureInfo) -> bytes:
     """A PNG: pictures of up to 20 frames, a bar of the split's colour above each, and the plan seen from above."""
     import matplotlib
 
@@ -34,8 +34,8 @@ def drawn(views: Sequence[FrameRecord], points: Sequence[np.ndarray], mesh: Mesh
         axis.set_axis_off()
     for axis, view in zip(axes, chosen, strict=False):
         axis.imshow(_small(view))
-        axis.set_title(f"{view.id.partition('-')[2][-18:]} {view.split}", fontsize=7, color="white", pad=3,
-                       backgroundcolor=COLOURS[view.split])  # fmt: skip
+        name = view.id.partition("-")[2][-18:]
+        axis.set_title(f"{name} {view.split}", fontsize=7, color="white", pad=3, backgroundcolor=COLOURS[view.split])
     _plan(right.subplots(), views, points, mesh, info)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
@@ -43,7 +43,7 @@ def drawn(views: Sequence[FrameRecord], points: Sequence[np.ndarray], mesh: Mesh
     return buffer.getvalue()
 
 
-def summary(views: Sequence[FrameRecord], points: Sequence[np.ndarray], mesh: Mesh | None, info: CaptureInfo) -> dict[str, Any]:
+def summary(views: Sequence[FrameRecord], points: list[np.ndarray], mesh: Mesh | None, info: CaptureInfo) -> dict[str, Any]:
     """What ``show`` tells of the capture."""
     sizes = Counter(f"{view.camera.width} x {view.camera.height}" for view in views)
     return {
@@ -59,7 +59,7 @@ def summary(views: Sequence[FrameRecord], points: Sequence[np.ndarray], mesh: Me
     }
 
 
-def _plan(axis: Any, views: Sequence[FrameRecord], points: Sequence[np.ndarray], mesh: Mesh | None, info: CaptureInfo) -> None:
+def _plan(axis: Any, views: Sequence[FrameRecord], points: list[np.ndarray], mesh: Mesh | None, info: CaptureInfo) -> None:
     """Cameras and points from above, the mean view upwards on the page, in metres or in hundredths of the radius."""
     up = np.array(info.up)
     look = -np.mean([view.camera.camera_to_world[:3, 2] for view in views], axis=0)
@@ -69,14 +69,14 @@ def _plan(axis: Any, views: Sequence[FrameRecord], points: Sequence[np.ndarray],
     ahead /= np.linalg.norm(ahead)
     flat = np.stack([np.cross(ahead, up), ahead], axis=1) / info.metre
     centre = np.array(info.centre)
-    surface = np.concatenate([np.zeros((0, 3)), *points]) if len(points) else np.zeros((0, 3)) if mesh is None else mesh.vertices
+    surface = np.concatenate([np.zeros((0, 3)), *(points or ([] if mesh is None else [mesh.vertices]))])
     if len(surface):
         surface = surface[:: max(len(surface) // DOTS, 1)].astype(np.float64) - centre
         height = surface @ up / info.metre
         low, high = np.percentile(height, [2, 98])
         order = np.argsort(height)
-        axis.scatter(*(surface[order] @ flat).T, c=height[order], s=0.5, cmap="gray", vmin=low, vmax=high + 0.3 * (high - low) + 1e-9,
-                     linewidths=0, rasterized=True)  # fmt: skip
+        brightest = high + 0.3 * (high - low) + 1e-9
+        axis.scatter(*(surface[order] @ flat).T, c=height[order], s=0.5, cmap="gray", vmin=low, vmax=brightest, linewidths=0)
     for split, colour in COLOURS.items():
         these = [view.camera for view in views if view.split == split]
         if these:
