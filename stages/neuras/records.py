@@ -137,7 +137,7 @@ class CaptureInfo:
 
 def frames(capture: Artifact, *splits: Split) -> Iterator[FrameRecord]:
     """The frames of these splits (all, if none is named), in order of their ids."""
-    for row in capture.rows():
+    for row in sorted(capture.rows(), key=lambda row: row.id):  # a store has them by group
         if row.id.startswith(FRAME):
             frame = FrameRecord.from_record(capture.read(row.id))
             if not splits or frame.split in splits:

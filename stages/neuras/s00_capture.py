@@ -8,7 +8,7 @@ right-handed world in the capture's own unit: what follows knows no set by name.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
@@ -18,7 +18,7 @@ from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.graphics.arrays import pack_json
 from stages.neuras.captures.sources import FolderConfig, FolderSource, Source
-from stages.neuras.records import POINTS, frames, point_sets, save
+from stages.neuras.records import POINTS, FrameRecord, frames, point_sets, save
 
 if TYPE_CHECKING:
     from pipeline.store import Draft
@@ -71,7 +71,8 @@ class Capture(MapStage):
         return config.name
 
     def identity(self, config: StageConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
-        return _source(config).hashes(hash_file) if isinstance(config, FolderConfig) else {}
+        source = _source(config)
+        return source.hashes(hash_file)
 
     def items(self, config: StageConfig, inputs: Inputs) -> Iterable[Item]:
         return [Item(id, group) for id, group in _source(config).items()]
@@ -92,22 +93,21 @@ class Capture(MapStage):
         mesh = source.mesh()
         if mesh is not None:
             save(draft.files / "mesh.npz", mesh)
-        views, points = list(frames(draft)), [record.points for record in point_sets(draft)]
-        (draft.files / "contact.png").write_bytes(sheet.drawn(views, points, mesh, info))
+        place = sheet.Place(info, [record.points for record in point_sets(draft)], mesh)
+        views = [replace(frame, picture=b"", depth=None) for frame in frames(draft)]  # pictures may be many
+        shown = [FrameRecord.from_record(draft.read(views[index].id)) for index in sheet.chosen(len(views))]
+        (draft.files / "contact.png").write_bytes(sheet.drawn(views, shown, place))
+        draft.note("summary", sheet.summary(views, place))
         if info.units == "arbitrary":
-            draft.log(
-                f"unit unknown ({info.source['units_from']}): a hundredth of the capture's radius, {info.metre:.4g}, stands for a "
-                "metre. Where the set is in metres: capture.units=metre"
-            )
-        draft.note("summary", sheet.summary(views, points, mesh, info))
+            nominal = f"a hundredth of the capture's radius, {info.metre:.4g}, stands for a metre"
+            draft.log(f"unit unknown ({info.source['units_from']}): {nominal}. If the set is in metres: capture.units=metre")
 
     def check(self, draft: Draft) -> None:
         if not draft.ids("train"):
             raise UserError("no training frame is left: see the rejected frames' reasons above")
 
 
-def _source(config: StageConfig, folder: Path | None = None) -> Any:
-    """The source that the config names; ``folder``: what its ``prepare`` wrote."""
+def _source(config: FolderConfig) -> Source:
     from stages.neuras.captures import colmap, nerfstudio, pandaset
 
     readers = {"nerfstudio": nerfstudio.read, "colmap": colmap.read, "pandaset": pandaset.read}

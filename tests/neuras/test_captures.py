@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import gzip
+import io
 import json
 import pickle
+import re
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
@@ -20,9 +23,10 @@ from pipeline.store.files import hash_file
 from stages.graphics.cameras import Camera
 from stages.neuras.captures import colmap, pickles, poses, splits
 from stages.neuras.captures.lenses import Lens, undistorted
-from stages.neuras.records import CaptureInfo, frames, given_mesh, point_sets
+from stages.neuras.records import CaptureInfo, FrameRecord, PointsRecord, frames, given_mesh, point_sets
 from stages.neuras.s00_capture import Capture
 
+ROOT = Path(__file__).resolve().parents[2]
 POINT = np.array([0.3, -0.2, 0.4])  # world; where every picture has its white dot
 WIDTH, HEIGHT, FX, FY, CX, CY = 160, 120, 130.0, 126.0, 83.0, 57.0
 LENSES = {
@@ -539,7 +543,7 @@ def test_the_stage_writes_frames_points_mesh_and_facts(tmp_path):
     edit(root, lambda told: turned(scale)(told["frames"][5], root))
     artifact, _ = run(tmp_path)
     assert [frame.id for frame in frames(artifact, "test")] == ["frame-01", "frame-03"]
-    assert sorted(frame.split for frame in frames(artifact)) == ["test", "test", "train", "train", "validation"]
+    assert [frame.split for frame in frames(artifact)] == ["train", "test", "train", "test", "validation"]
     assert [len(record.points) for record in point_sets(artifact)] == [50]
     assert len(given_mesh(artifact).faces) == 320
     info = CaptureInfo.of(artifact)
@@ -575,6 +579,58 @@ def test_the_mesh_is_part_of_the_key(tmp_path):
     before = identity()
     trimesh.creation.icosphere(subdivisions=1).export(tmp_path / "mesh.ply")
     assert before["mesh"] is None and identity()["mesh"] is not None and before["items"] == identity()["items"]
+
+
+class FakeSource:
+    """A source that lies in no folder."""
+
+    def items(self):
+        return [("frame-a", "train"), ("frame-b", "test"), ("points-a", "points")]
+
+    def frame(self, id):
+        buffer = io.BytesIO()
+        Image.new("RGB", (8, 6), (200, 10, 10)).save(buffer, "PNG")
+        camera = Camera.from_fov(8, 6, 60, np.eye(4))
+        return FrameRecord(id, camera, buffer.getvalue(), dict(self.items())[id], shift=1.5, depth=np.full((6, 8), 2.5))
+
+    def points(self, id):
+        return PointsRecord(id, np.array([[0, 0, -2.0]]), np.zeros(3))
+
+    def mesh(self):
+        return None
+
+    def info(self):
+        return CaptureInfo("metre", 1.0, (0.0, 1.0, 0.0), (0.0, 0.0, -1.0), 3.0, "lidar", "b is test")
+
+
+def test_the_stage_only_dispatches(tmp_path, monkeypatch):
+    from stages.neuras import s00_capture
+
+    nerfstudio(tmp_path / "set")
+    monkeypatch.setattr(s00_capture, "_source", lambda config: FakeSource())
+    monkeypatch.setattr(Capture, "identity", lambda self, config, hash_file: {})
+    artifact, _ = run(tmp_path)
+    found = {frame.id: (frame.split, frame.shift, float(frame.depth[0, 0])) for frame in frames(artifact)}
+    assert found == {"frame-a": ("train", 1.5, 2.5), "frame-b": ("test", 1.5, 2.5)}
+    assert [record.sensor.tolist() for record in point_sets(artifact)] == [[0, 0, 0]] and given_mesh(artifact) is None
+    assert CaptureInfo.of(artifact).split_rule == "b is test" and artifact.manifest["summary"]["summary"]["points"] == 1
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "conf/neuras/capture").glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_variants_settings_exist_and_are_the_defaults_but_for_what_it_says(path):
+    shared = OmegaConf.load(path.parent / "common/default.yaml")
+    given = OmegaConf.to_container(OmegaConf.merge({"seed": 0}, shared, OmegaConf.load(path)), resolve=False)
+    given.pop("defaults", None)
+    config = parse(Capture.Config, {**given, "seed": 0}, "capture")
+    assert config.name == path.stem
+    other = {name for name, value in config if value != type(config).model_fields[name].get_default(call_default_factory=True)}
+    assert other == ({"max_side"} if path.stem == "pandaset" else set())
+
+
+def test_every_reason_is_told_to_users():
+    page = (ROOT / "docs/captures.md").read_text()
+    told = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (`.*?) \|", page, flags=re.MULTILINE))))
+    assert told == set(Capture.reasons)
 
 
 # --- real captures ----------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,41 +18,60 @@ SHOWN = 20  # pictures
 DOTS = 60_000
 
 
-def drawn(views: Sequence[FrameRecord], points: list[np.ndarray], mesh: Mesh | None, info: CaptureInfo) -> bytes:
-    """A PNG: pictures of up to 20 frames, a bar of the split's colour above each, and the plan seen from above."""
+@dataclass(frozen=True, eq=False)
+class Place:
+    """What cameras stand in: facts, sets of points (P, 3), and the given mesh."""
+
+    info: CaptureInfo
+    points: list[np.ndarray]
+    mesh: Mesh | None
+
+    def surface(self) -> np.ndarray:
+        """(P, 3) float64: at most some ten thousand of the points, or of the mesh's vertices where there are none."""
+        all_points = np.concatenate([np.zeros((0, 3)), *(self.points or ([] if self.mesh is None else [self.mesh.vertices]))])
+        return all_points[:: max(len(all_points) // DOTS, 1)]
+
+
+def chosen(number: int) -> list[int]:
+    """Indices of the frames whose pictures are shown, evenly spaced."""
+    return np.unique(np.linspace(0, number - 1, min(SHOWN, number)).round().astype(int)).tolist()
+
+
+def drawn(views: Sequence[FrameRecord], shown: Sequence[FrameRecord], place: Place) -> bytes:
+    """A PNG: the pictures of ``shown`` under their splits' colours, and the plan of all ``views``, which need no pictures."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    chosen = [views[index] for index in np.unique(np.linspace(0, len(views) - 1, min(SHOWN, len(views))).round().astype(int))]
-    columns = min(max(round(np.sqrt(len(chosen) / 1.3)), 1), 4)
-    rows = -(-len(chosen) // columns)
+    columns = min(max(round(np.sqrt(len(shown) / 1.3)), 1), 4)
+    rows = -(-len(shown) // columns)
     figure = pyplot.figure(figsize=(15, max(1.35 * rows, 5.4)), dpi=100, layout="constrained")
     left, right = figure.subfigures(1, 2, width_ratios=(1.25, 1))
     axes = left.subplots(rows, columns, squeeze=False).ravel()
     for axis in axes:
         axis.set_axis_off()
-    for axis, view in zip(axes, chosen, strict=False):
+    for axis, view in zip(axes, shown, strict=False):
         axis.imshow(_small(view))
         name = view.id.partition("-")[2][-18:]
         axis.set_title(f"{name} {view.split}", fontsize=7, color="white", pad=3, backgroundcolor=COLOURS[view.split])
-    _plan(right.subplots(), views, points, mesh, info)
+    _plan(right.subplots(), views, place)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     pyplot.close(figure)
     return buffer.getvalue()
 
 
-def summary(views: Sequence[FrameRecord], points: list[np.ndarray], mesh: Mesh | None, info: CaptureInfo) -> dict[str, Any]:
+def summary(views: Sequence[FrameRecord], place: Place) -> dict[str, Any]:
     """What ``show`` tells of the capture."""
+    info = place.info
     sizes = Counter(f"{view.camera.width} x {view.camera.height}" for view in views)
     return {
         "frames": dict(sorted(Counter(view.split for view in views).items())),
         "sizes": dict(sorted(sizes.items())),
         "masks": sum(view.mask is not None for view in views),
-        "points": sum(map(len, points)),
-        "mesh_faces": 0 if mesh is None else len(mesh.faces),
+        "points": sum(map(len, place.points)),
+        "mesh_faces": 0 if place.mesh is None else len(place.mesh.faces),
         "units": f"{info.units} ({info.source.get('units_from', 'the source')})",
         "up": [round(x, 3) for x in info.up],
         "radius": round(info.radius, 3),
@@ -59,8 +79,9 @@ def summary(views: Sequence[FrameRecord], points: list[np.ndarray], mesh: Mesh |
     }
 
 
-def _plan(axis: Any, views: Sequence[FrameRecord], points: list[np.ndarray], mesh: Mesh | None, info: CaptureInfo) -> None:
+def _plan(axis: Any, views: Sequence[FrameRecord], place: Place) -> None:
     """Cameras and points from above, the mean view upwards on the page, in metres or in hundredths of the radius."""
+    info, surface = place.info, place.surface()
     up = np.array(info.up)
     look = -np.mean([view.camera.camera_to_world[:3, 2] for view in views], axis=0)
     ahead = look - (look @ up) * up
@@ -69,9 +90,8 @@ def _plan(axis: Any, views: Sequence[FrameRecord], points: list[np.ndarray], mes
     ahead /= np.linalg.norm(ahead)
     flat = np.stack([np.cross(ahead, up), ahead], axis=1) / info.metre
     centre = np.array(info.centre)
-    surface = np.concatenate([np.zeros((0, 3)), *(points or ([] if mesh is None else [mesh.vertices]))])
     if len(surface):
-        surface = surface[:: max(len(surface) // DOTS, 1)].astype(np.float64) - centre
+        surface = surface - centre
         height = surface @ up / info.metre
         low, high = np.percentile(height, [2, 98])
         order = np.argsort(height)

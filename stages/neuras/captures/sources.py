@@ -30,7 +30,10 @@ AXES = {sign + name: tuple((-1.0 if sign else 1.0) * (name == axis) for axis in 
 
 
 class Source(Protocol):
-    """A capture: its items, and what each becomes. An item's id is its record's id, ``frame-..`` or ``points-..``."""
+    """A capture: its items, and what each becomes. An item's id is its record's id, ``frame-..`` or ``points-..``.
+
+    ``items``, ``mesh`` and ``info`` are asked for outside the workers too: they may need nothing that is prepared.
+    """
 
     def items(self) -> list[tuple[str, str]]:
         """(id, group) of all items; the group is the frame's split, or "points"."""
@@ -41,7 +44,11 @@ class Source(Protocol):
     def points(self, id: str) -> PointsRecord:
         """The points; raises Reject."""
 
-    def info(self) -> CaptureInfo: ...
+    def mesh(self) -> Mesh | None:
+        """The given mesh, if there is one."""
+
+    def info(self) -> CaptureInfo:
+        """What holds for the whole capture."""
 
 
 class FolderConfig(StageConfig):
