@@ -45,7 +45,7 @@ stages.graphics.geometry  stages.graphics.statistics  stages.graphics.video  sta
 stages.graphics.metrics  stages.graphics.exr
 stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras
 stages.graphics
-model.renderformer
+model.renderformer  model.neuras
 model.training
 model.lpips  model.files
 model.errors

@@ -434,6 +434,19 @@ def test_links_that_lead_out_are_not_followed(tmp_path):
     assert caught.value.reason == "unsafe_path"
 
 
+@pytest.mark.parametrize(("name", "file"), [
+    ("nerfstudio", "transforms.json"), ("colmap", "sparse/0/cameras.bin"), ("pandaset", "camera/front_camera/poses.json"),
+])  # fmt: skip
+def test_a_sets_own_files_are_not_read_elsewhere(tmp_path, name, file):
+    root = tmp_path / "set"
+    {"nerfstudio": nerfstudio, "pandaset": pandaset, "colmap": lambda root: colmap_model(root, True)}[name](root)
+    source_of(root, name)
+    (root / file).rename(tmp_path / "elsewhere")
+    (root / file).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="has no|leads out"):
+        source_of(root, name)
+
+
 def test_whole_captures_that_cannot_be_read_say_why(tmp_path):
     with pytest.raises(UserError, match="has no transforms.json"):
         source_of(tmp_path)

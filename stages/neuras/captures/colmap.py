@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import Reject, UserError
+from stages.graphics.geometry.paths import inside
 from stages.neuras.captures import poses
 from stages.neuras.captures.lenses import Lens
 from stages.neuras.captures.sources import Inventory, PointSet, Shot, file_in, shot_of
@@ -67,8 +68,8 @@ def model_folder(model: str | None, root: Path) -> Path:
     """The folder with the model's files."""
     for name in (model,) if model else ("sparse/0", "sparse", "."):
         folder = root / name
-        if not folder.resolve().is_relative_to(root.resolve()):
-            raise UserError(f"capture.model={model!r} leads out of {str(root)!r}")
+        if not inside(folder, root):
+            raise UserError(f"{str(folder)!r} leads out of {str(root)!r}: the model must lie in the capture's folder")
         if _file(folder, "cameras") and _file(folder, "images"):
             return folder
     where = repr(model) if model else "sparse/0, sparse or the folder itself"
@@ -83,7 +84,8 @@ def camera_to_world(image: PosedImage) -> np.ndarray:
 
 def cameras(folder: Path) -> dict[int, Lens]:
     """Lenses by the model's numbers."""
-    rows = _lines(folder / "cameras.txt") if _text(folder, "cameras") else _binary_cameras(folder / "cameras.bin")
+    path = _file(folder, "cameras")
+    rows = _binary_cameras(path) if path.suffix == ".bin" else (line.split() for line in _text_lines(path))
     try:
         return {int(row[0]): _lens(*row[1:]) for row in rows}
     except (ValueError, IndexError, TypeError) as error:
@@ -91,9 +93,8 @@ def cameras(folder: Path) -> dict[int, Lens]:
 
 
 def images(folder: Path) -> list[PosedImage]:
-    if _text(folder, "images"):
-        return list(_text_images(folder / "images.txt"))
-    return list(_binary_images(folder / "images.bin"))
+    path = _file(folder, "images")
+    return list(_binary_images(path) if path.suffix == ".bin" else _text_images(path))
 
 
 def points(folder: Path, max_bytes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -131,12 +132,9 @@ def _lens(model: str, width: Any, height: Any, *parameters: Any) -> Lens:
     return Lens(int(width), int(height), fx, fy, cx, cy, radial, tangential)
 
 
-def _text(folder: Path, name: str) -> bool:
-    return not (folder / f"{name}.bin").is_file()
-
-
 def _file(folder: Path, name: str) -> Path | None:
-    return next((path for path in (folder / f"{name}.bin", folder / f"{name}.txt") if path.is_file()), None)
+    paths = (folder / f"{name}.bin", folder / f"{name}.txt")
+    return next((path for path in paths if path.is_file() and inside(path, folder)), None)
 
 
 # -- text
@@ -147,10 +145,6 @@ def _text_lines(path: Path) -> Iterator[str]:
         for line in file:
             if line.strip() and not line.startswith("#"):
                 yield line
-
-
-def _lines(path: Path) -> list[list[str]]:
-    return [line.split() for line in _text_lines(path)]
 
 
 def _text_images(path: Path) -> Iterator[PosedImage]:

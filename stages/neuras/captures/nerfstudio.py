@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.errors import Reject, UserError
 from stages.graphics.geometry.load import check_claims
+from stages.graphics.geometry.paths import inside
 from stages.neuras.captures import poses
 from stages.neuras.captures.lenses import Lens
 from stages.neuras.captures.sources import AXES, FolderConfig, Inventory, PointSet, Shot, file_in, shot_of
@@ -27,7 +28,7 @@ TERMS = ("k1", "k2", "k3", "k4", "p1", "p2")  # of the distortion
 def read(config: FolderConfig, root: Path) -> Inventory:
     """The inventory of ``transforms.json``."""
     path = root / FILE
-    if not path.is_file():
+    if not path.is_file() or not inside(path, root):
         raise UserError(f"capture.path={str(root)!r} has no {FILE}: capture=nerfstudio reads nerfstudio's layout")
     try:
         told = json.loads(path.read_bytes())

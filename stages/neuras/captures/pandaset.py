@@ -33,8 +33,8 @@ def _shots(root: Path, camera: str) -> list[Shot]:
     if "/" in camera or camera.startswith(".") or not folder.is_dir():
         known = sorted(path.name for path in (root / "camera").glob("*") if path.is_dir())
         raise UserError(f"capture.cameras: {str(root)!r} has no camera {camera!r}; it has {', '.join(known) or 'none'}")
-    placed, intrinsics = _json(folder / "poses.json", list), _json(folder / "intrinsics.json", dict)
-    times = _json(folder / "timestamps.json", list)
+    placed, intrinsics = _json(root, folder / "poses.json", list), _json(root, folder / "intrinsics.json", dict)
+    times = _json(root, folder / "timestamps.json", list)
     if len(times) != len(placed) or not all(isinstance(time, (int, float)) for time in times):
         raise UserError(f"{folder}: timestamps.json must hold one number for each of the {len(placed)} poses")
     shots = []
@@ -56,7 +56,7 @@ def _sweeps(root: Path) -> list[PointSet]:
     folder = root / "lidar"
     if not (folder / "poses.json").is_file():
         return []
-    sensors = _json(folder / "poses.json", list)
+    sensors = _json(root, folder / "poses.json", list)
     sets = []
     for index, pose in enumerate(sensors):
         path = folder / f"{index:02d}.pkl.gz"
@@ -93,7 +93,9 @@ def _lens(told: dict[str, Any], width: int, height: int) -> Lens:
     return lens
 
 
-def _json(path: Path, kind: type) -> Any:
+def _json(root: Path, path: Path, kind: type) -> Any:
+    if not inside(path, root):
+        raise UserError(f"{str(path)!r} leads out of {str(root)!r}")
     try:
         value = json.loads(path.read_bytes())
     except FileNotFoundError:
