@@ -267,12 +267,28 @@ def test_masks_follow_their_pictures(tmp_path):
     (tmp_path / "masks").mkdir()
     for number in range(6):
         mask = Image.new("L", (WIDTH, HEIGHT), 255)
-        ImageDraw.Draw(mask).rectangle((0, 0, 39, 59), fill=0)
+        ImageDraw.Draw(mask).rectangle((0, 0, 40, 58), fill=0)
         mask.save(tmp_path / "masks" / f"{number}.png")
     full, small = source_of(tmp_path).frame("frame-01").counts(), source_of(tmp_path, max_side=80).frame("frame-01").counts()
     expected = np.ones((HEIGHT, WIDTH), bool)
-    expected[:60, :40] = False
-    assert np.array_equal(full, expected) and np.array_equal(small, expected[::2, ::2])
+    expected[:59, :41] = False
+    assert np.array_equal(full, expected)
+    expected[:60, :42] = False  # one of four pixels is enough
+    assert np.array_equal(small, expected[::2, ::2])
+
+
+def test_masks_go_through_the_lens_with_their_pictures(tmp_path):
+    """Mask and image hold the same square; after the lens they still do."""
+    nerfstudio(tmp_path, terms={"k1": -0.3}, each=lambda number: {"mask_path": f"masks/{number}.png"})
+    (tmp_path / "masks").mkdir()
+    for number in range(6):
+        square = Image.new("L", (WIDTH, HEIGHT), 255)
+        ImageDraw.Draw(square).rectangle((8, 8, 40, 40), fill=0)
+        square.save(tmp_path / "masks" / f"{number}.png")
+        square.convert("RGB").save(tmp_path / "images" / f"{number:02d}.png")
+    frame = source_of(tmp_path).frame("frame-00")
+    white = frame.image()[..., 0] == 255
+    assert np.array_equal(frame.counts(), white) and 200 < (~white).sum() and not np.array_equal(~white[8:41, 8:41], True)
 
 
 # --- splits, units, up ------------------------------------------------------------------------------------------------
@@ -337,6 +353,19 @@ def test_upward(up, kind):
         assert np.linalg.det(pose[:3, :3]) > 0.99
         cameras.append(Camera.from_fov(8, 8, 60, pose))
     assert poses.upward(cameras) @ up > 0.999
+
+
+def test_the_ball_holds_what_cameras_see():
+    camera = Camera.from_fov(8, 8, 90, np.eye(4))  # looks along -z
+    seen = np.stack(np.meshgrid([-1.0, 1.0], np.linspace(-1, 1, 100), [-4.0]), axis=-1).reshape(-1, 3)
+    centre, radius = poses.ball([camera], seen)
+    assert np.allclose(centre, [0, 0, -2], atol=0.05) and radius == pytest.approx(np.sqrt(6), abs=0.05)
+    stray = np.array([[0, 0, 50.0], [80, 0, -1]])  # behind it, and beside its picture
+    assert poses.ball([camera], np.concatenate([seen, stray]))[1] == radius
+    far = np.concatenate([seen, [[0, 0, -900.0]]])  # seen, and alone
+    assert poses.ball([camera], far)[1] < 3
+    assert poses.ball([camera], np.zeros((0, 3)))[1] == 1.0
+    assert poses.in_view([camera], np.concatenate([seen, stray])).sum() == len(seen)
 
 
 # --- faults -----------------------------------------------------------------------------------------------------------
