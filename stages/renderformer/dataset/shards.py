@@ -132,15 +132,9 @@ class Remote:
     def _make_room(self, keep: Path) -> None:
         """Drop the shards that were not used for longest; readers that have one open are not disturbed."""
         with self._lock:
-<<<<<<< HEAD
-            found = [(path, path.stat()) for path in keep.parent.glob("[!.]*.tar")]
-            total = sum(stat.st_size for _, stat in found)
-            for path, stat in sorted(found, key=lambda item: item[1].st_mtime_ns):
-=======
-            files = [(path, path.stat()) for path in keep.parent.glob("*.tar")]
+            files = [(path, path.stat()) for path in keep.parent.glob("[!.]*.tar")]
             total = sum(stat.st_size for _, stat in files)
             for path, stat in sorted(files, key=lambda item: item[1].st_mtime_ns):
->>>>>>> h_pages
                 if total > self.limit and path != keep:
                     path.unlink(missing_ok=True)
                     total -= stat.st_size
