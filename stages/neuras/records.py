@@ -4,7 +4,7 @@ Frames: the world is the capture's, right-handed, in its own unit (``CaptureInfo
 ``stages.graphics.cameras.Camera``. Images are 8-bit sRGB, row 0 on top. Texture coordinates have (0, 0) at the upper left
 corner, v runs down: texel [row, column] has its centre at ((column + 0.5) / W, (row + 0.5) / H).
 
-A capture's artifact holds *frame* records ("frame/..") and *points* records ("points/.."), and the files ``capture.json``
+A capture's artifact holds *frame* records ("frame-..") and *points* records ("points-.."), and the files ``capture.json``
 (``CaptureInfo``) and, where a mesh is given, ``mesh.npz`` (``save_mesh``).
 """
 
@@ -24,6 +24,7 @@ from pipeline.store import Artifact
 from stages.graphics.arrays import pack_arrays, pack_json, unpack_arrays, unpack_json
 from stages.graphics.cameras import Camera
 
+FRAME, POINTS = "frame-", "points-"  # how the ids of a capture's records begin
 Split = Literal["train", "validation", "test", "shift"]  # shift: beside the driven path, only where truth exists
 
 
@@ -137,7 +138,7 @@ class CaptureInfo:
 def frames(capture: Artifact, *splits: Split) -> Iterator[FrameRecord]:
     """The frames of these splits (all, if none is named), in order of their ids."""
     for row in capture.rows():
-        if row.id.startswith("frame/"):
+        if row.id.startswith(FRAME):
             frame = FrameRecord.from_record(capture.read(row.id))
             if not splits or frame.split in splits:
                 yield frame
@@ -146,7 +147,7 @@ def frames(capture: Artifact, *splits: Split) -> Iterator[FrameRecord]:
 def point_sets(capture: Artifact) -> Iterator[PointsRecord]:
     """All points records, in order of their ids."""
     for row in capture.rows():
-        if row.id.startswith("points/"):
+        if row.id.startswith(POINTS):
             yield PointsRecord.from_record(capture.read(row.id))
 
 
