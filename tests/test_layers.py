@@ -35,7 +35,8 @@ stages.renderformer.dataset  stages.renderformer.scenes  stages.renderformer.obj
 stages.renderformer.views
 stages.renderformer.records
 stages
-stages.graphics.geometry  stages.graphics.statistics  stages.graphics.video  stages.graphics.device  stages.graphics.denoising
+stages.graphics.geometry  stages.graphics.mitsuba  stages.graphics.statistics  stages.graphics.video  \
+stages.graphics.device  stages.graphics.denoising
 stages.graphics.metrics  stages.graphics.exr
 stages.graphics.arrays  stages.graphics.tonemap
 stages.graphics
