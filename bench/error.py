@@ -20,7 +20,7 @@ import numpy as np
 from render import ROOT, Bench, View, choose_views, made_scenes, read_scenes
 
 from stages.graphics.denoising import denoise
-from stages.renderformer.rendering import backend as backends
+from stages.graphics.mitsuba import backend as backends
 
 SAMPLES = (16, 64, 256)
 FACTOR = 1.5  # within which an estimate counts as right

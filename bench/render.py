@@ -59,8 +59,8 @@ from pipeline.store import Artifact
 from stages.graphics import denoising
 from stages.graphics.exr import read_rgb
 from stages.graphics.metrics import log_error
+from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.records import SceneRecord
-from stages.renderformer.rendering import backend as backends
 from stages.renderformer.rendering.render import render_views
 from stages.renderformer.s04_render import Render
 from stages.renderformer.scenes.released import load_scene

@@ -55,8 +55,8 @@ def main() -> int:
     sys.path.insert(0, str(ROOT))
     from stages.graphics.exr import read_rgb
     from stages.graphics.metrics import log_error, psnr
+    from stages.graphics.mitsuba.backend import choose
     from stages.graphics.tonemap import clamp
-    from stages.renderformer.rendering.backend import choose
     from stages.renderformer.rendering.render import render_views
     from stages.renderformer.scenes.released import load_scene
 

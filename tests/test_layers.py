@@ -41,7 +41,8 @@ stages.neuras.rasterizing
 stages.neuras.records
 stages.neuras
 stages
-stages.graphics.geometry  stages.graphics.statistics  stages.graphics.video  stages.graphics.device  stages.graphics.denoising
+stages.graphics.geometry  stages.graphics.mitsuba  stages.graphics.statistics  stages.graphics.video  \
+stages.graphics.device  stages.graphics.denoising
 stages.graphics.metrics  stages.graphics.exr
 stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages.graphics.page
 stages.graphics

@@ -67,17 +67,17 @@ class Render(MapStage):
         return 4
 
     def environment(self, config: RenderConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
-        from stages.renderformer.rendering.backend import choose
+        from stages.graphics.mitsuba.backend import choose
 
         return choose(config.backend, previous)
 
     def same_environment(self, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-        from stages.renderformer.rendering.backend import same
+        from stages.graphics.mitsuba.backend import same
 
         return same(dict(one), dict(other))
 
     def max_workers(self, config: RenderConfig, environment: dict[str, Any]) -> int | None:
-        from stages.renderformer.rendering.backend import max_workers
+        from stages.graphics.mitsuba.backend import max_workers
 
         return max_workers(environment)
 

@@ -59,18 +59,18 @@ class RunProbe(MapStage):
 
     def environment(self, config: ProbeConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
         """The network's device and the path tracer's backend: others round otherwise."""
-        from stages.renderformer.rendering.backend import choose
+        from stages.graphics.mitsuba.backend import choose
 
         device = choose_device(config.device if previous is None else previous["device"], "probe.device")
         return {"device": device, "renderer": choose(config.backend, None if previous is None else previous["renderer"])}
 
     def same_environment(self, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-        from stages.renderformer.rendering.backend import same
+        from stages.graphics.mitsuba.backend import same
 
         return one["device"] == other["device"] and same(one["renderer"], other["renderer"])
 
     def max_workers(self, config: ProbeConfig, environment: dict[str, Any]) -> int | None:
-        from stages.renderformer.rendering.backend import max_workers
+        from stages.graphics.mitsuba.backend import max_workers
 
         return 1 if environment["device"] == "cuda" else max_workers(environment["renderer"])
 

@@ -137,7 +137,7 @@ def cube(tmp_path):
 @pytest.fixture
 def scalar(monkeypatch):
     """Path tracing without the seconds that a JIT compiler takes."""
-    from stages.renderformer.rendering import backend
+    from stages.graphics.mitsuba import backend
 
     monkeypatch.setattr(backend, "choose", lambda choice: {"backend": "scalar"})
 

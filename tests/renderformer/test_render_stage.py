@@ -13,9 +13,10 @@ from pipeline.errors import Reject, UserError
 from pipeline.stage import Item, Record
 from stages.graphics.arrays import pack_json, unpack_json
 from stages.graphics.metrics import log_error, psnr
+from stages.graphics.mitsuba import backend
 from stages.graphics.tonemap import clamp
 from stages.renderformer.records import ViewRecord
-from stages.renderformer.rendering import backend, noise, sheet
+from stages.renderformer.rendering import noise, sheet
 from stages.renderformer.rendering.render import render_views
 from stages.renderformer.s04_render import Render, RenderConfig
 from stages.renderformer.s08_probe import RunProbe

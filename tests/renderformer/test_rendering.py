@@ -13,8 +13,8 @@ import pytest
 from pipeline.errors import UserError
 from stages.graphics.exr import read_rgb
 from stages.graphics.metrics import log_error
+from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.records import SceneRecord
-from stages.renderformer.rendering import backend as backends
 from stages.renderformer.rendering.render import render_views
 from stages.renderformer.views import encode_view
 
@@ -448,41 +448,6 @@ def test_means_match_cycles(shared_data, jit, name, spp, tolerance):
 
 
 # --- the backend, the command ------------------------------------------------------------------------------
-
-
-def test_without_a_jit_backend_the_scalar_one_is_taken_with_a_word(monkeypatch, caplog):
-    monkeypatch.setattr(backends, "works", lambda candidate: candidate["backend"] == "scalar")
-    assert backends.choose("auto") == SCALAR
-    assert "libllvm19" in caplog.text
-    with pytest.raises(UserError, match="backend=llvm does not work here"):
-        backends.choose("llvm")
-    with pytest.raises(UserError, match="unknown"):
-        backends.choose("metal")
-
-
-def test_workers_spread_over_the_gpus(tmp_path, monkeypatch):
-    smi = tmp_path / "nvidia-smi"
-    smi.write_text("#!/bin/sh\necho 'GPU 0: NVIDIA A (UUID: GPU-aa)'\necho 'GPU 1: NVIDIA B (UUID: GPU-bb)'\n")
-    smi.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    monkeypatch.setattr(backends.tempfile, "gettempdir", lambda: str(tmp_path))
-    taken, kept = [], []  # a lock lasts as long as its file is open: one set of claims stands for each process
-    for _ in range(5):
-        monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-        monkeypatch.setattr(backends, "_claims", [])
-        backends.claim_gpu()
-        taken.append(os.environ["CUDA_VISIBLE_DEVICES"])
-        kept.append(backends._claims)
-    assert taken == ["GPU-aa", "GPU-bb", "GPU-aa", "GPU-bb", "GPU-aa"]
-    kept[1][0].close()  # that process died: its place is free
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
-    monkeypatch.setattr(backends, "_claims", [])
-    backends.claim_gpu()
-    assert os.environ["CUDA_VISIBLE_DEVICES"] == "GPU-bb"
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-bb")
-    assert backends.gpus() == ["GPU-bb"] and {"backend": "cuda"} in backends.candidates("auto")
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert backends.gpus() == [] and {"backend": "cuda"} not in backends.candidates("auto")
 
 
 def test_trace_writes_one_file_per_view(tmp_path, shared_data, monkeypatch):

@@ -140,8 +140,8 @@ def compare_scene(
     metrics: Mapping[str, Metric] = METRICS,
 ) -> Comparison:
     """One camera of a scene or mesh file: path traced with ``spp`` samples and denoised, and predicted."""
+    from stages.graphics.mitsuba.backend import choose
     from stages.renderformer.inference.renderer import Renderer
-    from stages.renderformer.rendering.backend import choose
     from stages.renderformer.rendering.render import render_views
 
     if spp < 1:

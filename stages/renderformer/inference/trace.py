@@ -32,8 +32,8 @@ def trace(
     triangles, room: of a mesh, as of ``load_scene``. lights_visible: to the camera; training images hide them.
     """
     from stages.graphics.exr import write_rgb
+    from stages.graphics.mitsuba.backend import choose
     from stages.renderformer.inference.scene_files import load_scene
-    from stages.renderformer.rendering.backend import choose
     from stages.renderformer.rendering.render import render_views
 
     out = Path(out_path)

@@ -67,7 +67,7 @@ class Worker:
 
     config: Any
     inputs: Inputs
-    renderer: dict[str, Any]  # a backend that ``stages.renderformer.rendering.backend`` chose
+    renderer: dict[str, Any]  # a backend that ``stages.graphics.mitsuba.backend`` chose
     device: str = "cpu"
 
     @cached_property

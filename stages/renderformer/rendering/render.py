@@ -19,8 +19,8 @@ import numpy as np
 
 from pipeline.errors import UserError
 from stages.graphics.denoising import denoise as denoise_layer
+from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.records import SceneRecord, ViewRecord
-from stages.renderformer.rendering import backend as backends
 from stages.renderformer.rendering.error import Judge
 from stages.renderformer.rendering.sums import Sums
 from stages.renderformer.views import clamped_values
@@ -54,7 +54,7 @@ def render_views(
     target_error: a view gets 16 samples, then 32, 48, 64, 96, 128, 192 .. until its estimated error
         (``stages.renderformer.rendering.error``) is at most this, from the second portion on guided by what the first has found
         (``stages.renderformer.rendering.guiding``); 0: ``max_spp`` at once, no guiding, and no estimate.
-    backend: from ``stages.renderformer.rendering.backend.choose``. max_depth: longest path in segments; 2 is direct light only.
+    backend: from ``stages.graphics.mitsuba.backend.choose``. max_depth: longest path in segments; 2 is direct light only.
     lights_visible: whether camera rays see lights (reflections always do).
     """
     if mode not in MODES:

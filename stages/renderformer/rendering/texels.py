@@ -14,8 +14,8 @@ import numpy as np
 
 from pipeline.errors import UserError
 from stages.graphics.geometry.measure import normal_vectors
+from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.records import PATCH_CHANNELS, PATCH_SIDE, SceneRecord
-from stages.renderformer.rendering import backend as backends
 
 HEIGHT = 1e-4  # scene units above a surface from where it is looked at
 INSET = 1e-3  # least barycentric weight of a point: edges belong to nobody

@@ -1,8 +1,8 @@
 """Which Mitsuba variant works here: CUDA, LLVM with one of the installed libraries, or the scalar fall-back.
 
 A JIT compiler that does not fit the machine aborts the whole process (libLLVM 14 and 15 on recent CPUs), so each
-candidate proves itself in a child process that renders a tiny scene with the integrator of this package. The answer
-is plain JSON, which the render stage records and passes to its workers: ``{"backend": "llvm", "llvm": 19}``. It names LLVM
+candidate proves itself in a child process that path traces a tiny scene (``trial``). The answer
+is plain JSON, which a stage records and passes to its workers: ``{"backend": "llvm", "llvm": 19}``. It names LLVM
 by its major version, not by path: a path changes with every small upgrade and from machine to machine.
 """
 
@@ -157,7 +157,7 @@ def works(candidate: dict[str, Any]) -> bool:
 def _proof(candidate: str) -> bool:
     root = str(Path(__file__).resolve().parents[3])
     path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-    command = [sys.executable, "-m", "stages.renderformer.rendering.trial", candidate]
+    command = [sys.executable, "-m", "stages.graphics.mitsuba.trial", candidate]
     try:
         child = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, timeout=PROBE_SECONDS)
     except subprocess.TimeoutExpired:
@@ -183,7 +183,7 @@ def choose(choice: str = "auto", previous: dict[str, Any] | None = None) -> dict
             return previous
         raise UserError(
             f"this artifact was begun with the backend {_title(previous)}, which does not work here: finish it "
-            "where it does, or start it anew with force=render"
+            "where it does, or start it anew with force=STAGE"
         )
     for candidate in candidates(choice):
         if works(candidate):
