@@ -360,7 +360,7 @@ def test_the_ball_holds_what_cameras_see():
     seen = np.stack(np.meshgrid([-1.0, 1.0], np.linspace(-1, 1, 100), [-4.0]), axis=-1).reshape(-1, 3)
     centre, radius = poses.ball([camera], seen)
     assert np.allclose(centre, [0, 0, -2], atol=0.05) and radius == pytest.approx(np.sqrt(6), abs=0.05)
-    stray = np.array([[0, 0, 50.0], [80, 0, -1]])  # behind it, and beside its picture
+    stray = np.repeat([[0, 0, 50.0], [80, 0, -1]], 50, axis=0)  # behind it, and beside its picture
     assert poses.ball([camera], np.concatenate([seen, stray]))[1] == radius
     far = np.concatenate([seen, [[0, 0, -900.0]]])  # seen, and alone
     assert poses.ball([camera], far)[1] < 3
