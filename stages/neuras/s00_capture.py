@@ -7,21 +7,30 @@ right-handed world in the capture's own unit: what follows knows no set by name.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from pipeline.config import StageConfig
+from pipeline.config import StageConfig, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.graphics.arrays import pack_json
 from stages.neuras.captures.sources import FolderConfig, FolderSource, Source
 from stages.neuras.records import POINTS, FrameRecord, frames, point_sets, save
+from stages.neuras.street.settings import StreetConfig
 
 if TYPE_CHECKING:
     from pipeline.store import Draft
+
+
+class StreetCaptureConfig(StreetConfig, StageConfig):
+    """The embedded default: a street that is made up and path traced."""
+
+    name: Literal["street"] = "street"
+    backend: Literal["auto", "cuda", "llvm", "scalar"] = runtime("auto")  # of the path tracer; auto: the best that works here
 
 
 class NerfstudioConfig(FolderConfig):
@@ -48,7 +57,9 @@ class PandasetConfig(FolderConfig):
 class Capture(MapStage):
     name: ClassVar[str] = "capture"
     version: ClassVar[int] = 1
-    Config: ClassVar[Any] = Annotated[NerfstudioConfig | ColmapConfig | PandasetConfig, Field(discriminator="name")]
+    Config: ClassVar[Any] = Annotated[
+        StreetCaptureConfig | NerfstudioConfig | ColmapConfig | PandasetConfig, Field(discriminator="name")
+    ]
     reasons: ClassVar[dict[str, str]] = {
         "no_pose": "the frame has no camera pose, or one of another shape",
         "left_handed": "the axes of its pose are mirrored",
@@ -68,17 +79,48 @@ class Capture(MapStage):
     limits: ClassVar[dict[str, float]] = {"cpu_s": 600.0, "wall_s": 1800.0, "memory_gb": 8.0}
 
     def slug(self, config: StageConfig) -> str:
-        return config.name
+        return config.preset if isinstance(config, StreetCaptureConfig) else config.name
 
     def identity(self, config: StageConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
         source = _source(config)
-        return source.hashes(hash_file)
+        return source.hashes(hash_file) if isinstance(source, FolderSource) else {}
+
+    def environment(self, config: StageConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
+        from stages.graphics.mitsuba.backend import choose
+
+        return choose(config.backend, previous) if isinstance(config, StreetCaptureConfig) else {}
+
+    def same_environment(self, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+        from stages.graphics.mitsuba.backend import same
+
+        return same(dict(one), dict(other)) if one and other else one == other
+
+    def max_workers(self, config: StageConfig, environment: dict[str, Any]) -> int | None:
+        from stages.graphics.mitsuba.backend import max_workers
+
+        return max_workers(environment) if environment else None
+
+    def part_size(self, config: StageConfig, inputs: Inputs) -> int:
+        return 4 if isinstance(config, StreetCaptureConfig) else 16  # a path traced frame takes seconds
 
     def items(self, config: StageConfig, inputs: Inputs) -> Iterable[Item]:
         return [Item(id, group) for id, group in _source(config).items()]
 
-    def open(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any]) -> Source:
-        return _source(config)
+    def prepare(self, config: StageConfig, inputs: Inputs, folder: Path) -> None:
+        """The made-up place, which all workers look at."""
+        if isinstance(config, StreetCaptureConfig):
+            from stages.neuras.street import source
+
+            source.prepare(config, folder)
+
+    def open_prepared(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any], folder: Path) -> Source:
+        if not isinstance(config, StreetCaptureConfig):
+            return _source(config)
+        from stages.graphics.mitsuba import backend
+        from stages.neuras.street.source import StreetSource
+
+        backend.activate(environment, threads=1)
+        return StreetSource(config, folder)
 
     def process(self, worker: Source, item: Item) -> Iterator[Record]:
         record = worker.points(item.id) if item.id.startswith(POINTS) else worker.frame(item.id)
@@ -107,8 +149,12 @@ class Capture(MapStage):
             raise UserError("no training frame is left: see the rejected frames' reasons above")
 
 
-def _source(config: FolderConfig) -> Source:
+def _source(config: StageConfig) -> Source:
     from stages.neuras.captures import colmap, nerfstudio, pandaset
+    from stages.neuras.street.source import StreetSource
+
+    if isinstance(config, StreetCaptureConfig):
+        return StreetSource(config)
 
     readers = {"nerfstudio": nerfstudio.read, "colmap": colmap.read, "pandaset": pandaset.read}
     return FolderSource(config, readers[config.name])

@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.keys import seed_for
-from stages.graphics.arrays import pack_json, unpack_json
-from stages.graphics.mitsuba import backend
 from stages.neuras.rasterizing.casting import Caster
 from stages.neuras.records import CaptureInfo, FrameRecord, PointsRecord
 from stages.neuras.street import lidar
@@ -20,13 +18,15 @@ from stages.neuras.street.settings import StreetConfig
 
 
 def prepare(config: StreetConfig, folder: Path) -> None:
-    """Make the place once, for all workers: its arrays, and which renderer works here."""
+    """Make the place once, for all workers."""
     make(config.preset, config.seed, config.length, config.texture_size).save(folder)
-    (folder / "backend.json").write_bytes(pack_json(backend.choose()))
 
 
 class StreetSource:
-    """Frames and sweeps of the place that ``prepare`` wrote to ``folder``; ``items`` and ``info`` need none."""
+    """Frames and sweeps of the place that ``prepare`` wrote to ``folder``; ``items`` and ``info`` need none.
+
+    A frame needs Mitsuba with a variant chosen (``stages.graphics.mitsuba.backend.activate``).
+    """
 
     def __init__(self, config: StreetConfig, folder: Path | None = None):
         self.config, self.folder = config, folder
@@ -86,5 +86,4 @@ class StreetSource:
 
     @functools.cached_property
     def _renderer(self) -> Renderer:
-        backend.activate(unpack_json((self.folder / "backend.json").read_bytes()), threads=1)
         return Renderer(self._city)
