@@ -16,11 +16,11 @@ from stages.graphics.denoising import denoise
 from stages.graphics.tonemap import srgb_encode
 from stages.neuras.street.city import City, Group
 
-BOUNCES = 5
+BOUNCES = 4  # segments of the longest path
 SUN = 3.4  # irradiance of a surface that faces the sun, before the exposure
 SUN_COLOUR = (1.0, 0.93, 0.8)
 INDEX = 1.9  # of refraction of glass and clear coats: higher than real, as panes have two sides
-EXPOSURE = 1.05
+EXPOSURE = 1.35
 
 
 class Renderer:
@@ -30,10 +30,9 @@ class Renderer:
         import mitsuba as mi
 
         turn = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
-        sky = np.roll(city.sky, city.sky.shape[1] // 2, axis=1) if False else city.sky
         scene: dict[str, Any] = {
             "type": "scene",
-            "sky": {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(sky)), "to_world": turn},
+            "sky": {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(city.sky)), "to_world": turn},
             "sun": {
                 "type": "directional",
                 "direction": (-city.sun).tolist(),

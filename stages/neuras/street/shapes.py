@@ -42,9 +42,9 @@ class Soup:
         self.count += len(vertices)
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(V, 3) float32 vertices, (V, 2) float32 uvs, (F, 3) int32 faces."""
+        """(V, 3) float32 vertices, (F, 3) int32 faces, (V, 2) float32 uvs."""
         vertices, uvs, faces = (np.concatenate(part) for part in (self.vertices, self.uvs, self.faces))
-        return vertices.astype(np.float32), uvs.astype(np.float32), faces.astype(np.int32)
+        return vertices.astype(np.float32), faces.astype(np.int32), uvs.astype(np.float32)
 
 
 class Shapes:
