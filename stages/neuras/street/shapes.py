@@ -137,7 +137,7 @@ class Shapes:
             for outline in (sections[0], sections[-1]):
                 points = np.concatenate([outline, outline.mean(axis=0)[None]])
                 k = len(outline)
-                fan = np.stack([np.arange(k - 1), np.arange(1, k), np.full(k - 1, k)], axis=1)
+                fan = np.stack([np.arange(k), (np.arange(k) + 1) % k, np.full(k, k)], axis=1)
                 self.mesh(material, points, fan, points[:, [1, 2]] / metres)
 
     def cards(self, material: str, centres: np.ndarray, normals: np.ndarray, sizes: np.ndarray, spin: np.ndarray, spots: np.ndarray) -> None:

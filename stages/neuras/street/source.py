@@ -87,4 +87,4 @@ class StreetSource:
     @functools.cached_property
     def _renderer(self) -> Renderer:
         backend.activate(unpack_json((self.folder / "backend.json").read_bytes()), threads=1)
-        return Renderer(self._city)
+        return Renderer(self._city, self._caster)

@@ -272,7 +272,7 @@ def draw_shop(rng: np.random.Generator, picture: Image.Image) -> None:
         x = 0.0
         while x < s:
             w, h = rng.uniform(0.03, 0.12) * s, rng.uniform(0.3, 0.95) * 0.78 * s / rows
-            pen.rectangle((x, floor - h, x + w - 1, floor), fill=_colour(rng, (0, 1), (0.1, 0.9), (0.25, 0.95)))
+            pen.rectangle((x, floor - h, max(x, x + w - 1), floor), fill=_colour(rng, (0, 1), (0.1, 0.9), (0.25, 0.95)))
             x += w * rng.uniform(1, 1.35)
         pen.line((0, floor, s, floor), fill=(70, 52, 40), width=max(2, s // 60))
 
