@@ -67,7 +67,7 @@ def _street(config: StreetConfig) -> list[Pose]:
         split: Split = "train" if number % 2 == 0 else "validation" if between else "test"
         out.append(Pose(f"frame-drive_{number:04d}", _on_lane(config, x, 0.0), split, time=number * config.spacing / config.speed))
     for shift in config.shifts:
-        lane = f"shift_{shift:+g}m"
+        lane = f"shift_{abs(shift):g}m_{'right' if shift > 0 else 'left'}".replace(".", "_")
         # Between training frames, as the held-out frames are: nowhere beside a training camera.
         steps = np.round(np.linspace(1, 2 * config.training_frames - 3, config.shift_frames) / 2 - 0.5) * 2 + 1
         for number, step in enumerate(steps):

@@ -100,16 +100,11 @@ def make(preset: str, seed: int, length: float, texture_size: int = 1024) -> Cit
     for number, name in enumerate(sorted(shapes.soups)):
         maker, kind, roughness, scale = palette[name]
         texture = maker(np.random.default_rng([seed, 3, number]), max(32, int(texture_size * scale)))
-        groups.append(Group(name, *_ordered(shapes.soups[name].arrays()), texture, kind, roughness))
+        groups.append(Group(name, *shapes.soups[name].arrays(), texture, kind, roughness))
     sky_rng = np.random.default_rng([seed, 4])
     elevation, azimuth = np.radians(sky_rng.uniform(36, 52)), np.radians(sky_rng.choice([-1, 1]) * sky_rng.uniform(35, 125))
     sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     return City(tuple(groups), sky(sky_rng, sun), sun, houses)
-
-
-def _ordered(arrays: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    vertices, uvs, faces = arrays
-    return vertices, faces, uvs
 
 
 def sky(rng: np.random.Generator, sun: np.ndarray, height: int = 512) -> np.ndarray:
@@ -188,9 +183,8 @@ def _street(shapes: Shapes, rng: np.random.Generator, length: float) -> int:
         _pavement_things(shapes, rng, sign, spans)
         _parked(shapes, rng, sign, spans)
     for x in crosses:
-        for sign in (-1, 1):
-            furniture.traffic_light(shapes.at(x - CROSS / 2 + 0.6, sign * (ROAD + 0.5), KERB, 0 if sign < 0 else np.pi / 1e9), rng) if sign < 0 else \
-                furniture.traffic_light(shapes.at(x + CROSS / 2 - 0.6, ROAD + 0.5, KERB, np.pi), rng)
+        furniture.traffic_light(shapes.at(x - CROSS / 2 + 0.6, -ROAD - 0.5, KERB), rng)
+        furniture.traffic_light(shapes.at(x + CROSS / 2 - 0.6, ROAD + 0.5, KERB, np.pi), rng)
     for x in np.arange(18, length, 34):  # wires across
         z = rng.uniform(6.5, 7.6)
         shapes.tube("iron", (x, -FRONT, z), (x, 0, z - 0.5), (0.015, 0.015), 4)
@@ -245,9 +239,6 @@ def _side_street(shapes: Shapes, rng: np.random.Generator, sign: int, x: float) 
         while y < 62:
             width = rng.uniform(9, 12)
             style = Style.draw(rng, WALLS, ROOFS, (1, 4), rng.random() < 0.3, ("flat", "gable", "mansard"))
-            # The front faces the side street's middle: +x for the houses on its low side.
-            along = sign * (y + width if side * sign > 0 else y)
-            frame = shapes.at(x + side * CROSS / 2, along, KERB, -np.pi / 2 if side < 0 else np.pi / 2)
             low = sign * y if sign > 0 else sign * (y + width)
             frame = shapes.at(x - CROSS / 2, low + width, KERB, -np.pi / 2) if side < 0 else shapes.at(x + CROSS / 2, low, KERB, np.pi / 2)
             building(frame, rng, width, 10, style, (y < FRONT + 15, False))
@@ -276,13 +267,8 @@ def _ground(shapes: Shapes, rng: np.random.Generator, length: float, spans: list
             for side in (-1, 1):
                 x0, x1 = sorted((x + side * 4, x + side * CROSS / 2))
                 shapes.box("pavement", x0, y0, -0.1, x1, y1, KERB, 4.0)
-    _ground_beyond(shapes, length)
+    shapes.floor("grass", -FAR, -FAR, length + FAR, FAR, -0.06, 6.0, 40.0)  # under and around everything
     _markings(shapes, rng, length, crosses)
-
-
-def _ground_beyond(shapes: Shapes, length: float) -> None:
-    """Grass under and around everything, just below the road."""
-    shapes.floor("grass", -FAR, -FAR, length + FAR, FAR, -0.06, 6.0, 40.0)
 
 
 def _markings(shapes: Shapes, rng: np.random.Generator, length: float, crosses: np.ndarray) -> None:
@@ -358,17 +344,13 @@ def _skyline(shapes: Shapes, rng: np.random.Generator, length: float, preset: st
         frame = shapes.at(*(centre + away * np.array([np.cos(angle), np.sin(angle)])), -1, angle + np.pi / 2)
         for x0, y0, x1, y1 in ((-wide, -deep, wide, -deep), (-wide, deep, wide, deep), (-wide, -deep, -wide, deep), (wide, -deep, wide, deep)):
             corners = np.array([[x0, y0, 0], [x1, y1, 0], [x1, y1, high], [x0, y0, high]]) / [2, 2, 1]
-            frame.pictures("towers", corners, cell_of(rng))
+            frame.pictures("towers", corners, textures.cell(int(rng.integers(16))))
         frame.box("gravel", -wide / 2, -deep / 2, high, wide / 2, deep / 2, high + 1, 6.0)
     for angle in rng.uniform(0, 2 * np.pi, 260):
         away = reach * rng.uniform(0.98, 1.5)
         place = centre + away * np.array([np.cos(angle), np.sin(angle)])
         furniture.tree(shapes.at(*place, -1), rng, rng.uniform(9, 17), 60)
     shapes.floor("grass", centre[0] - 2000, centre[1] - 2000, centre[0] + 2000, centre[1] + 2000, -1.0, 40.0, 500.0)
-
-
-def cell_of(rng: np.random.Generator) -> np.ndarray:
-    return textures.cell(int(rng.integers(16)))
 
 
 # --- blocks of houses, for a flight over them ---------------------------------------------------------------------------

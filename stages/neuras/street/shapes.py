@@ -42,9 +42,9 @@ class Soup:
         self.count += len(vertices)
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(V, 3) float32 vertices, (V, 2) float32 uvs, (F, 3) int32 faces."""
+        """(V, 3) float32 vertices, (F, 3) int32 faces, (V, 2) float32 uvs."""
         vertices, uvs, faces = (np.concatenate(part) for part in (self.vertices, self.uvs, self.faces))
-        return vertices.astype(np.float32), uvs.astype(np.float32), faces.astype(np.int32)
+        return vertices.astype(np.float32), faces.astype(np.int32), uvs.astype(np.float32)
 
 
 class Shapes:
@@ -137,7 +137,7 @@ class Shapes:
             for outline in (sections[0], sections[-1]):
                 points = np.concatenate([outline, outline.mean(axis=0)[None]])
                 k = len(outline)
-                fan = np.stack([np.arange(k - 1), np.arange(1, k), np.full(k - 1, k)], axis=1)
+                fan = np.stack([np.arange(k), (np.arange(k) + 1) % k, np.full(k, k)], axis=1)
                 self.mesh(material, points, fan, points[:, [1, 2]] / metres)
 
     def cards(self, material: str, centres: np.ndarray, normals: np.ndarray, sizes: np.ndarray, spin: np.ndarray, spots: np.ndarray) -> None:

@@ -86,4 +86,4 @@ class StreetSource:
 
     @functools.cached_property
     def _renderer(self) -> Renderer:
-        return Renderer(self._city)
+        return Renderer(self._city, self._caster)

@@ -48,7 +48,7 @@ def _weathered(rng: np.random.Generator, colours: np.ndarray, stains: float = 1.
     blotches = fractal(rng, size, 1, 12, 1.4)
     streaks = np.maximum(fractal(rng, size, 4, size / 4, 0.8, stretch=14) - 0.4, 0)
     grain = fractal(rng, size, 40, size / 2, 0.2)
-    shade = 1 + stains * (0.07 * blotches - 0.12 * streaks) + 0.055 * grain
+    shade = 1 + stains * (0.06 * blotches - 0.09 * streaks) + 0.04 * grain
     return finished(colours * shade[..., None])
 
 
@@ -65,21 +65,23 @@ def _courses(rng: np.random.Generator, size: int, rows: int, columns: int, joint
 
 
 def brick(rng: np.random.Generator, size: int) -> np.ndarray:
-    base = hue(rng, (-0.01, 0.09), (0.25, 0.65), (0.4, 0.75))
+    base = hue(rng, (0.0, 0.09), (0.2, 0.55), (0.45, 0.75))
     block, joints = _courses(rng, size, 64, 22, 0.16)
-    colours = base * (0.62 + 0.7 * block[..., None])
+    colours = base * (0.72 + 0.5 * block[..., None])
     odd = (block > 0.93)[..., None]
     colours = np.where(odd, base * 0.45, colours)
     return _weathered(rng, np.where(joints[..., None], hue(rng, (0.05, 0.15), (0.02, 0.15), (0.5, 0.85)), colours))
 
 
 def plaster(rng: np.random.Generator, size: int) -> np.ndarray:
-    base = hue(rng, (-0.03, 0.62), (0.08, 0.42), (0.6, 0.95))
-    chips = fractal(rng, size, 3, 90, 1.0) > 1.75
+    kind = rng.random()  # mostly ochre, cream and rose; some yellow, pale blue, pale green
+    hues, most = ((0.0, 0.11), 0.4) if kind < 0.6 else ((0.11, 0.16), 0.5) if kind < 0.78 else ((0.53, 0.62), 0.28) if kind < 0.9 else ((0.25, 0.42), 0.2)
+    base = hue(rng, hues, (0.06, most), (0.68, 0.97))
+    chips = fractal(rng, size, 3, 90, 1.0) > 2.2
     under = _courses(rng, size, 64, 22, 0.16)[0][..., None] * 0.3 + 0.35
     colours = np.where(chips[..., None], under * np.array([1.0, 0.8, 0.7]), base * np.ones((size, size, 1)))
-    speckle = 1 + 0.06 * fractal(rng, size, 60, size / 2, 0)
-    return _weathered(rng, colours * speckle[..., None], 1.6)
+    speckle = 1 + 0.045 * fractal(rng, size, 60, size / 2, 0)
+    return _weathered(rng, colours * speckle[..., None], 1.1)
 
 
 def stone(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -91,14 +93,14 @@ def stone(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def panels(rng: np.random.Generator, size: int) -> np.ndarray:
-    base = hue(rng, (0.0, 1.0), (0.03, 0.3), (0.4, 0.8))
+    base = hue(rng, (0.0, 0.7), (0.02, 0.15), (0.5, 0.85))
     block, joints = _courses(rng, size, 6, 8, 0.03, 0)
     pits = np.maximum(fractal(rng, size, 30, size / 3, 0.3) - 1.6, 0)
     return _weathered(rng, np.where(joints[..., None], base * 0.4, base * (0.85 + 0.25 * block - 0.25 * pits)[..., None]), 1.5)
 
 
 def siding(rng: np.random.Generator, size: int) -> np.ndarray:
-    base = hue(rng, (0.0, 0.7), (0.1, 0.45), (0.5, 0.95))
+    base = hue(rng, (0.0, 0.65), (0.05, 0.3), (0.6, 0.95))
     block, _ = _courses(rng, size, 36, 4, 0.1)
     v = ((np.arange(size) + 0.5) / size * 36) % 1
     wood = fractal(rng, size, 8, size / 2, 0.6, stretch=0.08)
@@ -118,7 +120,7 @@ def tiles(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def asphalt(rng: np.random.Generator, size: int) -> np.ndarray:
-    grey = 0.36 + 0.03 * fractal(rng, size, 1, 10, 1.2) + 0.05 * fractal(rng, size, 40, size / 2, -0.1)
+    grey = 0.42 + 0.03 * fractal(rng, size, 1, 10, 1.2) + 0.04 * fractal(rng, size, 40, size / 2, -0.1)
     stones = fractal(rng, size, size / 6, size / 2, 0) > 2.0
     grey = np.where(stones, grey + 0.2, grey)
     cracks = np.abs(fractal(rng, size, 2, 30, 1.3)) < 0.016
@@ -147,9 +149,9 @@ def slabs(rng: np.random.Generator, size: int) -> np.ndarray:
 def grass(rng: np.random.Generator, size: int) -> np.ndarray:
     blades = fractal(rng, size, 20, size / 2, 0.3)
     dry = np.clip(0.5 + 0.5 * fractal(rng, size, 1, 12, 1.2), 0, 1)[..., None]
-    colours = np.array([0.28, 0.42, 0.16]) * (1 - dry) + np.array([0.5, 0.5, 0.26]) * dry
-    flowers = (fractal(rng, size, size / 8, size / 3, 0) > 3.0)[..., None]
-    return finished(np.where(flowers, np.array([0.9, 0.88, 0.6]), colours * (1 + 0.28 * blades[..., None])))
+    colours = np.array([0.28, 0.42, 0.16]) * (1 - dry) + np.array([0.42, 0.45, 0.23]) * dry
+    flowers = (fractal(rng, size, size / 8, size / 3, 0) > 3.4)[..., None]
+    return finished(np.where(flowers, np.array([0.9, 0.88, 0.6]), colours * (1 + 0.2 * blades[..., None])))
 
 
 def gravel(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -270,7 +272,7 @@ def draw_shop(rng: np.random.Generator, picture: Image.Image) -> None:
         x = 0.0
         while x < s:
             w, h = rng.uniform(0.03, 0.12) * s, rng.uniform(0.3, 0.95) * 0.78 * s / rows
-            pen.rectangle((x, floor - h, x + w - 1, floor), fill=_colour(rng, (0, 1), (0.1, 0.9), (0.25, 0.95)))
+            pen.rectangle((x, floor - h, max(x, x + w - 1), floor), fill=_colour(rng, (0, 1), (0.1, 0.9), (0.25, 0.95)))
             x += w * rng.uniform(1, 1.35)
         pen.line((0, floor, s, floor), fill=(70, 52, 40), width=max(2, s // 60))
 
