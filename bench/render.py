@@ -62,6 +62,7 @@ from stages.graphics.metrics import log_error
 from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.records import SceneRecord
 from stages.renderformer.rendering.render import render_views
+from stages.renderformer.rendering.settings import RenderSettings
 from stages.renderformer.s04_render import Render
 from stages.renderformer.scenes.released import load_scene
 from stages.renderformer.views import encode_view, view_members
@@ -195,7 +196,7 @@ def choose_views(scenes: list[SceneRecord], count: int, folder: Path, backend: d
             if len(views) == count or camera >= len(scene.fov_deg):
                 continue
             one = replace(scene, camera_to_world=scene.camera_to_world[[camera]], fov_deg=scene.fov_deg[[camera]])
-            probe = render_views(one, 64, max_spp=16, seed=0, backend=backend, denoise=False, threads=threads)[0]
+            probe = render_views(one, RenderSettings(64, 16, denoise=False), backend, threads=threads)[0]
             if probe.meta["status"] == "ok":
                 name = f"{len(views)}-{scene.id}-{camera}"
                 np.savez(folder / f"{name}.npz", **one.arrays())
@@ -223,16 +224,9 @@ class Bench:
     def render(self, view: View, what: str, spp: int, **named: Any) -> tuple[float, Any]:
         """(seconds, view record); ``what`` decides the random numbers."""
         began = time.perf_counter()
-        record = render_views(
-            view.scene,
-            self.arguments.resolution,
-            max_spp=spp,
-            seed=seed_for(self.arguments.seed, f"bench/{what}", view.name),
-            backend=self.backend,
-            max_depth=MAX_DEPTH,
-            threads=self.arguments.threads,
-            **named,
-        )[0]
+        seed = seed_for(self.arguments.seed, f"bench/{what}", view.name)
+        settings = RenderSettings(self.arguments.resolution, spp, seed, max_depth=MAX_DEPTH, **named)
+        record = render_views(view.scene, settings, self.backend, threads=self.arguments.threads)[0]
         return time.perf_counter() - began, record
 
     def truth(self, view: View, cycles: Cycles | None = None) -> Truth:
@@ -373,7 +367,7 @@ class BuiltIn:
 
 def warm_up(scene: SceneRecord, backend: dict[str, Any], threads: int) -> None:
     """Compile the kernels, which counts as start-up."""
-    render_views(scene, 8, max_spp=32, target_error=1e-9, seed=0, backend=backend, max_depth=MAX_DEPTH, threads=threads)
+    render_views(scene, RenderSettings(8, 32, target_error=1e-9, max_depth=MAX_DEPTH), backend, threads=threads)
 
 
 # --- whole processes --------------------------------------------------------------------------------------------------
@@ -393,16 +387,9 @@ def produce(job: dict[str, Any]) -> dict[str, Any]:
     rows = []
     for path in map(Path, job["arrays"]):
         start = time.perf_counter()
-        record = render_views(
-            read_arrays(path),
-            job["resolution"],
-            max_spp=job["max_spp"],
-            seed=seed_for(job["seed"], "bench/produce", path.stem),
-            backend=backend,
-            target_error=job["target"],
-            max_depth=MAX_DEPTH,
-            threads=job["threads"],
-        )[0]
+        seed = seed_for(job["seed"], "bench/produce", path.stem)
+        settings = RenderSettings(job["resolution"], job["max_spp"], seed, job["target"], max_depth=MAX_DEPTH)
+        record = render_views(read_arrays(path), settings, backend, threads=job["threads"])[0]
         (Path(job["out"]) / f"{path.stem}.exr").write_bytes(encode_view(record)[view_members(record.meta["index"])[0]])
         rows.append({"seconds": time.perf_counter() - start, "spp": record.meta["spp"], "estimate": record.meta["error"]})
     return {"seconds": time.perf_counter() - began, "views": rows}

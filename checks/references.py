@@ -58,6 +58,7 @@ def main() -> int:
     from stages.graphics.mitsuba.backend import choose
     from stages.graphics.tonemap import clamp
     from stages.renderformer.rendering.render import render_views
+    from stages.renderformer.rendering.settings import RenderSettings
     from stages.renderformer.scenes.released import load_scene
 
     backend, failed = choose(), 0
@@ -67,8 +68,8 @@ def main() -> int:
         return read_rgb(found[0]) if found else None
 
     def ours(scene, truth: np.ndarray, spp: int, **named) -> np.ndarray:
-        kept = {"target_error": 0, "seed": 0, "backend": backend, "views": [0], "lights_visible": True}
-        return render_views(scene, len(truth), max_spp=spp, **kept, **named)[0].image
+        settings = RenderSettings(len(truth), spp, lights_visible=True, **named)
+        return render_views(scene, settings, backend, [0])[0].image
 
     def again(scene, resolution: int) -> np.ndarray:
         with tempfile.TemporaryDirectory() as folder:

@@ -15,20 +15,18 @@ from pipeline.errors import UserError
 
 def command_trace(arguments: argparse.Namespace) -> int:
     from stages.renderformer.inference.trace import trace
+    from stages.renderformer.rendering.settings import RenderSettings
 
-    for path in trace(
-        Path(arguments.scene),
-        Path(arguments.out),
-        resolution=arguments.resolution,
-        spp=arguments.spp,
+    settings = RenderSettings(
+        arguments.resolution,
+        arguments.spp,
+        arguments.seed,
         mode=arguments.mode,
         denoise=arguments.denoise,
-        seed=arguments.seed,
-        view=arguments.view,
         lights_visible=arguments.lights_visible,
-        triangles=arguments.triangles,
-        room=room(arguments),
-    ):
+    )
+    view, triangles = arguments.view, arguments.triangles
+    for path in trace(arguments.scene, arguments.out, settings, view, triangles=triangles, room=room(arguments)):
         print(path)
     return 0
 

@@ -14,6 +14,7 @@ import os
 from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
@@ -22,6 +23,7 @@ from pipeline.config import StageConfig, runtime
 from pipeline.errors import Reject
 from pipeline.keys import seed_for
 from pipeline.stage import Inputs, Item, MapStage, Record
+from stages.renderformer.rendering.settings import RenderSettings
 
 if TYPE_CHECKING:
     from stages.renderformer.records import ViewRecord
@@ -38,6 +40,11 @@ class RenderConfig(StageConfig):
     lights_visible: bool = False  # whether cameras see lights; reflections always do
     noise_share: float = Field(0.01, ge=0, le=1)  # of the views, rendered twice to tell the dataset's noise floor
     backend: Literal["auto", "cuda", "llvm", "scalar"] = runtime("auto")  # auto: the best that works here
+
+    def settings(self, seed: int) -> RenderSettings:
+        """Of a scene, whose ``seed`` follows from the stage's."""
+        names = {field.name for field in fields(RenderSettings)} - {"seed"}
+        return RenderSettings(seed=seed, **{name: getattr(self, name) for name in names})
 
 
 class RenderWorker:
@@ -99,20 +106,7 @@ class Render(MapStage):
         scene = SceneRecord.from_record(worker.scenes.read(item.id))
 
         def render(seed: int, views: list[int] | None = None) -> list[ViewRecord]:
-            return render_views(
-                scene,
-                config.resolution,
-                max_spp=config.max_spp,
-                target_error=config.target_error,
-                seed=seed,
-                backend=worker.backend,
-                views=views,
-                mode=config.mode,
-                max_depth=config.max_depth,
-                denoise=config.denoise,
-                lights_visible=config.lights_visible,
-                threads=worker.threads,
-            )
+            return render_views(scene, config.settings(seed), worker.backend, views, worker.threads)
 
         views = render(seed_for(config.seed, self.name, item.id))
         statuses = Counter(view.meta["status"] for view in views)

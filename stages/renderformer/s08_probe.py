@@ -21,14 +21,14 @@ from pipeline.config import StageConfig
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.graphics.device import choose_device
-from stages.renderformer.probes import attention, made, sweeps, timing, tokens
+from stages.renderformer.probes import attention, built_scenes, sweeps, timing, tokens
 from stages.renderformer.probes.probe import Outcome, Probe, ProbeConfig, Worker
 
 if TYPE_CHECKING:
     from pipeline.store import Draft
 
 PROBES: Mapping[str, Probe] = {
-    probe.name: probe() for module in (timing, sweeps, made, attention, tokens) for probe in module.PROBES
+    probe.name: probe() for module in (timing, sweeps, built_scenes, attention, tokens) for probe in module.PROBES
 }
 
 

@@ -13,6 +13,7 @@ from pipeline.keys import digest_of
 from pipeline.stage import Record
 from pipeline.store import Artifact, Store
 from stages.graphics.arrays import pack_arrays, pack_json
+from stages.renderformer.records import SceneRecord, ViewRecord
 
 
 class FakeArtifact:
@@ -171,3 +172,13 @@ def commit_shards(root: Path, inputs: dict, stage, config, per_shard: int) -> Ar
     stage.check(draft)
     manifest = {"key": draft.key, "preimage": preimage, "outputs": draft.outputs(), "summary": draft.summary, "finished": 0.0}
     return store.commit(draft, stage.slug(config), manifest)
+
+
+def path_traced(
+    scene: SceneRecord, resolution: int, *, backend: dict, views=None, threads=None, **settings
+) -> list[ViewRecord]:
+    """``render_views`` in one call; ``settings`` are fields of `RenderSettings`."""
+    from stages.renderformer.rendering.render import render_views
+    from stages.renderformer.rendering.settings import RenderSettings
+
+    return render_views(scene, RenderSettings(resolution, **settings), backend, views, threads)

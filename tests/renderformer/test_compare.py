@@ -144,14 +144,14 @@ def scalar(monkeypatch):
 
 def test_a_scene_is_traced_and_predicted_from_the_same_arrays(cube, checkpoint, scalar):
     from stages.renderformer.inference.renderer import Renderer
-    from stages.renderformer.rendering.render import render_views
+    from tests.renderformer.fakes import path_traced
 
     result = compare_scene(cube, checkpoint, 24, spp=3)
     renderer = Renderer(checkpoint)
     scene = renderer.load(cube)
     with pytest.warns(UserWarning, match="trained with 16x16"):
         assert result.test == pytest.approx(renderer.render(scene, resolution=24))
-    (view,) = render_views(scene, 24, max_spp=3, seed=0, backend={"backend": "scalar"})
+    (view,) = path_traced(scene, 24, max_spp=3, seed=0, backend={"backend": "scalar"})
     assert np.array_equal(result.reference, view.image)
     assert result.metrics == measure_all(result.reference, result.test)
     assert "resolution 24x24: the checkpoint was trained with 16x16" in result.table()  # what limits the prediction is told

@@ -22,10 +22,10 @@ SPP = 256
 
 
 def path_trace(scene: SceneRecord, seed: int, views=VIEWS) -> list:
-    from stages.renderformer.rendering.render import render_views
+    from tests.renderformer.fakes import path_traced
 
     scalar = {"backend": "scalar", "variant": "scalar_rgb"}
-    return render_views(scene, 20, max_spp=SPP, seed=seed, backend=scalar, views=[int(v) for v in views], denoise=False)
+    return path_traced(scene, 20, max_spp=SPP, seed=seed, backend=scalar, views=[int(v) for v in views], denoise=False)
 
 
 def images(views: list) -> np.ndarray:

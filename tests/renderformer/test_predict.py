@@ -163,10 +163,10 @@ def test_a_mesh_stands_in_its_room_in_front_of_the_camera(cube, template):
 
 
 def test_the_room_is_lit_and_no_wall_hides_the_object(cube):
-    from stages.renderformer.rendering.render import render_views
+    from tests.renderformer.fakes import path_traced
 
     scene = load_scene(cube, None, Room("corner"))
-    (view,) = render_views(scene, 32, max_spp=12, seed=0, backend={"backend": "scalar"}, denoise=False)
+    (view,) = path_traced(scene, 32, max_spp=12, seed=0, backend={"backend": "scalar"}, denoise=False)
     index = next(i for i, entry in enumerate(scene.meta["objects"]) if entry["kind"] == "object")
     assert (view.object == index).mean() > 0.1
     bright = view.image[view.object == index].mean(axis=1)

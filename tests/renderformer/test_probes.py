@@ -14,7 +14,7 @@ from pipeline.errors import UserError
 from pipeline.hydra_config import CONF, compose
 from pipeline.plan import base_key, plan_stage
 from stages.renderformer.inference.predict import single_lights
-from stages.renderformer.probes import attention, edits, made, tokens
+from stages.renderformer.probes import attention, built_scenes, edits, tokens
 from stages.renderformer.probes.probe import slug
 from stages.renderformer.probes.sweeps import ColouredLight, Lights, TriangleSize
 from stages.renderformer.records import SceneRecord
@@ -158,12 +158,13 @@ class TestEdits:
 
     @pytest.mark.parametrize("number", [1, 4, 9, 36])
     def test_plates_have_equal_triangles_and_area(self, number):
-        vertices, faces = made.plates(number, 0.3)
+        vertices, faces = built_scenes.plates(number, 0.3)
         size = edits.areas(vertices[faces])
-        assert len(faces) == 72 and np.allclose(size, size[0]) and size.sum() == pytest.approx(made.SHEET_SIDE**2)
+        assert len(faces) == 72 and np.allclose(size, size[0]) and size.sum() == pytest.approx(built_scenes.SHEET_SIDE**2)
         flat = np.round(vertices[:, :2] @ [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]], 6)
         gaps = np.diff(np.unique(flat[:, 0]))
-        assert (gaps > made.SHEET_SIDE / 6 - 1e-6).sum() + (gaps < made.SHEET_SIDE / 6 - 1e-6).sum() == len(gaps)
+        side = built_scenes.SHEET_SIDE / 6 - 1e-6
+        assert (gaps > side).sum() + (gaps < side).sum() == len(gaps)
         assert len(np.unique(flat[:, 0])) == round(number**0.5) * (6 // round(number**0.5) + 1)  # gaps between plates
 
 

@@ -17,11 +17,10 @@ from stages.graphics.mitsuba import backend
 from stages.graphics.tonemap import clamp
 from stages.renderformer.records import ViewRecord
 from stages.renderformer.rendering import noise, sheet
-from stages.renderformer.rendering.render import render_views
 from stages.renderformer.s04_render import Render, RenderConfig
 from stages.renderformer.s08_probe import RunProbe
 from stages.renderformer.views import decode_view, encode_view, view_members
-from tests.renderformer.fakes import FakeArtifact
+from tests.renderformer.fakes import FakeArtifact, path_traced
 from tests.renderformer.test_rendering import SCALAR, camera, clutter
 
 CONFIG = {"resolution": 16, "max_spp": 4, "target_error": 0.0}
@@ -267,8 +266,8 @@ def test_noise_floor_is_the_known_noise_of_synthetic_pairs():
 
 def test_noise_floor_is_the_true_error_of_a_real_scene():
     scene, kept = clutter(cameras=1), {"backend": SCALAR, "denoise": False}
-    (truth,) = render_views(scene, 24, max_spp=4096, seed=9, **kept)
-    (a,), (b,) = (render_views(scene, 24, max_spp=48, seed=seed, **kept) for seed in (0, 1))
+    (truth,) = path_traced(scene, 24, max_spp=4096, seed=9, **kept)
+    (a,), (b,) = (path_traced(scene, 24, max_spp=48, seed=seed, **kept) for seed in (0, 1))
     told = noise.pair_error(a, b, np.random.default_rng(0))
     assert told["sum"]["log_error"] == pytest.approx(log_error(a.image, truth.image), rel=0.25)
     rng = np.random.default_rng(0)

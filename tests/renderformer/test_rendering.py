@@ -15,8 +15,9 @@ from stages.graphics.exr import read_rgb
 from stages.graphics.metrics import log_error
 from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.records import SceneRecord
-from stages.renderformer.rendering.render import render_views
+from stages.renderformer.rendering.settings import RenderSettings
 from stages.renderformer.views import encode_view
+from tests.renderformer.fakes import path_traced
 
 SCALAR = {"backend": "scalar"}
 
@@ -113,7 +114,7 @@ def test_small_light_over_a_diffuse_plane(backend, flip):
     pose = camera((-0.5, 0, 1.5), (-0.5, 0, 0), (0, 1, 0))
     plane = quad((0, 0, 0), (3, 0, 0), (0, 3, 0))
     scene = build([(plane, (0.2, 0.5, 0.8), 0, 1)], [(light[None], (900, 600, 300))], [pose], fov=1.0)
-    view = render_views(scene, 8, max_spp=64, seed=1, backend=backend, denoise=False)[0]
+    view = path_traced(scene, 8, max_spp=64, seed=1, backend=backend, denoise=False)[0]
     area = np.linalg.norm(np.cross(light[1] - light[0], light[2] - light[0])) / 2
     way = light.mean(axis=0) - [-0.5, 0, 0]
     distance2 = way @ way
@@ -135,11 +136,11 @@ def test_white_furnace(backend, diffuse, specular, roughness):
     ]
     inside = quad((0, 0, 0), (0.5, 0.1, 0), (0, 0.3, 0.5))
     scene = build([(inside, diffuse, specular, roughness)], [(np.concatenate(faces), 1)], [camera((0, -2, 0.3))])
-    view = render_views(scene, 16, max_spp=64, seed=1, backend=backend, denoise=False, lights_visible=True)[0]
+    view = path_traced(scene, 16, max_spp=64, seed=1, backend=backend, denoise=False, lights_visible=True)[0]
     # Rough facets send a little of the light below the surface: single scattering loses it.
     assert np.allclose(view.image.mean(axis=(0, 1)), 1, atol=0.01)
     assert view.coverage.min() == 1
-    hidden = render_views(scene, 16, max_spp=64, seed=1, backend=backend, denoise=False)[0]
+    hidden = path_traced(scene, 16, max_spp=64, seed=1, backend=backend, denoise=False)[0]
     assert np.allclose(hidden.image.mean(axis=-1), hidden.coverage, atol=0.45)  # the scalar one: other samples
     assert 0 < hidden.coverage.mean() < 1
 
@@ -163,7 +164,7 @@ def cast(triangles, origin, directions):
 def test_coverage_and_triangles_are_a_ray_cast(backend):
     scene, size = clutter(), 24
     scene.object_index = np.arange(len(scene.triangles), dtype=np.int16) // 2
-    view = render_views(scene, size, max_spp=32, seed=0, backend=backend, denoise=False, views=[1])[0]
+    view = path_traced(scene, size, max_spp=32, seed=0, backend=backend, denoise=False, views=[1])[0]
     half = np.tan(np.radians(scene.fov_deg[1] / 2))
     x, y = np.meshgrid((2 * np.arange(size) + 1) / size - 1, 1 - (2 * np.arange(size) + 1) / size)
     local = np.stack([x * half, y * half, -np.ones_like(x)], axis=-1)
@@ -188,7 +189,7 @@ def test_lights_are_hidden_from_cameras_but_not_from_reflections(backend):
     back = quad((0, 1, 0.3), (1, 0, 0), (0, 0, 0.9))
     scene = build([(mirror, 0, 0.9, 0.01), (back, 0.001, 0, 1)], [(light, 10)], [camera((0, -2, 0.5))], fov=45)
     kept = {"max_spp": 32, "seed": 0, "backend": backend, "denoise": False}
-    shown, hidden = (render_views(scene, 24, lights_visible=flag, **kept)[0] for flag in (True, False))
+    shown, hidden = (path_traced(scene, 24, lights_visible=flag, **kept)[0] for flag in (True, False))
     bright = np.abs(shown.image.mean(axis=-1) - 10) < 1e-3  # wholly on the light
     bright[12:] = False  # not on its reflection
     assert bright.sum() > 8
@@ -207,7 +208,7 @@ def test_lights_apart_sum_to_the_plain_render(jit):
     apart = clutter(lights=6)
     together = clutter(lights=6)
     together.light_index[together.light_index >= 0] = 0
-    a, b = (render_views(scene, 16, max_spp=16, seed=3, backend=jit, denoise=False)[0] for scene in (apart, together))
+    a, b = (path_traced(scene, 16, max_spp=16, seed=3, backend=jit, denoise=False)[0] for scene in (apart, together))
     assert a.lights.shape == (6, 16, 16, 3) and b.lights.shape == (1, 16, 16, 3)
     assert np.allclose(a.image, b.image, rtol=1e-4, atol=1e-5)
     assert np.allclose(a.direct, b.direct, rtol=1e-4, atol=1e-5)
@@ -216,12 +217,12 @@ def test_lights_apart_sum_to_the_plain_render(jit):
 def test_more_than_eight_lights(backend):
     """Ten lights, each against a render with the others dark."""
     scene = clutter(lights=10, cameras=1)
-    view = render_views(scene, 16, max_spp=256, seed=0, backend=backend, denoise=False)[0]
+    view = path_traced(scene, 16, max_spp=256, seed=0, backend=backend, denoise=False)[0]
     assert view.lights.shape[0] == 10
     for light in (0, 9):
         alone = clutter(lights=10, cameras=1)
         alone.emission[alone.light_index != light] = 0
-        only = render_views(alone, 16, max_spp=256, seed=1, backend=backend, denoise=False)[0]
+        only = path_traced(alone, 16, max_spp=256, seed=1, backend=backend, denoise=False)[0]
         assert not np.delete(only.lights, light, axis=0).any()
         assert np.allclose(only.image.mean(), view.lights[light].mean(), rtol=0.05)
     assert view.direct.mean() < view.image.mean()
@@ -229,15 +230,15 @@ def test_more_than_eight_lights(backend):
 
 def test_no_light_is_dark(backend):
     scene = clutter(lights=0, cameras=1)
-    view = render_views(scene, 8, max_spp=4, seed=0, backend=backend)[0]
+    view = path_traced(scene, 8, max_spp=4, seed=0, backend=backend)[0]
     assert view.lights.shape == (0, 8, 8, 3) and view.meta["status"] == "dark"
     assert view.coverage.max() == 1
 
 
 def test_scalar_and_jit_agree(jit):
     scene = clutter(lights=3, cameras=1)
-    a = render_views(scene, 16, max_spp=512, seed=0, backend=jit, denoise=False)[0]
-    b = render_views(scene, 16, max_spp=1024, seed=0, backend=SCALAR, denoise=False)[0]
+    a = path_traced(scene, 16, max_spp=512, seed=0, backend=jit, denoise=False)[0]
+    b = path_traced(scene, 16, max_spp=1024, seed=0, backend=SCALAR, denoise=False)[0]
     for light in range(3):
         assert np.allclose(a.lights[light].mean(axis=(0, 1)), b.lights[light].mean(axis=(0, 1)), rtol=0.04)
     assert np.allclose(a.direct.mean(axis=(0, 1)), b.direct.mean(axis=(0, 1)), rtol=0.02)
@@ -252,9 +253,9 @@ def test_scalar_and_jit_agree(jit):
 @pytest.mark.parametrize(("spp", "target"), [(8, 0), (48, 1e-9)], ids=["plain", "guided"])
 def test_bytes_do_not_depend_on_threads(backend, spp, target):
     scene, kept = clutter(), {"max_spp": spp, "target_error": target, "backend": backend}
-    runs = [hashed(render_views(scene, 16, seed=2, threads=threads, **kept)) for threads in (1, 2, 2)]
+    runs = [hashed(path_traced(scene, 16, seed=2, threads=threads, **kept)) for threads in (1, 2, 2)]
     assert runs[0] == runs[1] == runs[2]
-    assert hashed(render_views(scene, 16, seed=3, **kept)) != runs[0]
+    assert hashed(path_traced(scene, 16, seed=3, **kept)) != runs[0]
 
 
 @pytest.mark.parametrize("target", [0, 1e-9], ids=["plain", "guided"])
@@ -262,12 +263,12 @@ def test_bytes_do_not_depend_on_views_or_chunks(jit, monkeypatch, target):
     from stages.renderformer.rendering import jit as module
 
     scene, kept = clutter(), {"max_spp": 44, "seed": 2, "backend": jit, "denoise": False, "target_error": target}
-    whole = render_views(scene, 16, **kept)
-    assert hashed(render_views(scene, 16, views=[1], **kept)) == hashed(whole)[1:]
+    whole = path_traced(scene, 16, **kept)
+    assert hashed(path_traced(scene, 16, views=[1], **kept)) == hashed(whole)[1:]
     monkeypatch.setattr(module, "CHUNK", 100)  # lanes, of six blocks for each pixel
-    assert hashed(render_views(scene, 16, **kept)) == hashed(whole)
+    assert hashed(path_traced(scene, 16, **kept)) == hashed(whole)
     monkeypatch.setattr(module, "GROUP", 4)  # blocks in flight for each pixel: memory is bounded at any number of samples
-    for a, b in zip(render_views(scene, 16, **kept), whole, strict=True):
+    for a, b in zip(path_traced(scene, 16, **kept), whole, strict=True):
         np.testing.assert_allclose(a.lights, b.lights, rtol=1e-6)
         assert np.array_equal(a.triangle, b.triangle) and a.meta["nearest"] == b.meta["nearest"]
 
@@ -293,10 +294,8 @@ def test_denoiser_gives_the_same_bytes_for_any_thread_count():
 
 def test_denoising_comes_nearer_to_the_truth(backend):
     scene = clutter(cameras=1)
-    truth = render_views(scene, 32, max_spp=1024, seed=9, backend=backend, denoise=False)[0].image
-    noisy, clean = (
-        render_views(scene, 32, max_spp=8, seed=0, backend=backend, denoise=flag)[0].image for flag in (False, True)
-    )
+    truth = path_traced(scene, 32, max_spp=1024, seed=9, backend=backend, denoise=False)[0].image
+    noisy, clean = (path_traced(scene, 32, max_spp=8, seed=0, backend=backend, denoise=flag)[0].image for flag in (False, True))
 
     def error(image):
         return np.abs(np.log10(1 + image) - np.log10(1 + truth)).mean()
@@ -307,15 +306,14 @@ def test_denoising_comes_nearer_to_the_truth(backend):
 def test_samples_are_spent_until_the_target_is_met(backend):
     scene, kept = clutter(), {"seed": 0, "backend": backend, "denoise": False}
     needs = [
-        [view.meta for view in render_views(scene, 16, max_spp=256, target_error=target, **kept)]
-        for target in (1.0, 0.02, 1e-9)
+        [view.meta for view in path_traced(scene, 16, max_spp=256, target_error=target, **kept)] for target in (1.0, 0.02, 1e-9)
     ]
     for target, metas in zip((1.0, 0.02, 1e-9), needs, strict=True):
         for meta in metas:
             assert meta["error"] <= target or meta["spp"] + meta["dropped"] == 256
     first, middle, last = ([meta["spp"] + meta["dropped"] for meta in metas] for metas in needs)
     assert first == [16, 16] and last == [256, 256] and all(16 <= spp < 256 for spp in middle)
-    capped = render_views(scene, 16, max_spp=24, target_error=1e-9, **kept)
+    capped = path_traced(scene, 16, max_spp=24, target_error=1e-9, **kept)
     assert [view.meta["spp"] for view in capped] == [24, 24]
 
 
@@ -350,9 +348,9 @@ def test_guiding_finds_caustics_and_keeps_the_mean(jit):
 
 def test_first_samples_are_dropped_where_the_target_is_far(jit):
     kept = {"seed": 0, "backend": jit, "denoise": False}
-    error = render_views(caustic(), 32, max_spp=16, target_error=1e-9, **kept)[0].meta["error"]
+    error = path_traced(caustic(), 32, max_spp=16, target_error=1e-9, **kept)[0].meta["error"]
     for max_spp, target, counts in ((128, error / 3, (112, 16)), (128, error / 1.5, (None, 0)), (24, error / 3, (24, 0))):
-        meta = render_views(caustic(), 32, max_spp=max_spp, target_error=target, **kept)[0].meta
+        meta = path_traced(caustic(), 32, max_spp=max_spp, target_error=target, **kept)[0].meta
         assert (counts[0] or meta["spp"], counts[1]) == (meta["spp"], meta["dropped"])
 
 
@@ -396,11 +394,11 @@ def test_sampler_fills_every_pair_of_dimensions_evenly(jit):
 
 def test_raw_error_estimate_is_the_error(backend):
     scene, kept = clutter(cameras=1), {"backend": backend, "denoise": False}
-    truth = render_views(scene, 32, max_spp=4096, seed=9, **kept)[0].image
+    truth = path_traced(scene, 32, max_spp=4096, seed=9, **kept)[0].image
     for spp in (16, 64):
-        view = render_views(scene, 32, max_spp=spp, target_error=1e-9, seed=0, **kept)[0]
+        view = path_traced(scene, 32, max_spp=spp, target_error=1e-9, seed=0, **kept)[0]
         assert view.meta["error"] == pytest.approx(log_error(view.image, truth), rel=0.2)
-    assert render_views(scene, 16, max_spp=1, seed=0, **kept)[0].meta["error"] is None
+    assert path_traced(scene, 16, max_spp=1, seed=0, **kept)[0].meta["error"] is None
 
 
 def test_scale_changes_nothing(jit):
@@ -409,7 +407,7 @@ def test_scale_changes_nothing(jit):
     large.triangles = 2 * large.triangles
     large.camera_to_world = large.camera_to_world.copy()
     large.camera_to_world[:, :3, 3] *= 2
-    a, b = (render_views(record, 16, max_spp=64, seed=0, backend=jit, denoise=False)[0] for record in (scene, large))
+    a, b = (path_traced(record, 16, max_spp=64, seed=0, backend=jit, denoise=False)[0] for record in (scene, large))
     assert np.allclose(a.image.mean(), b.image.mean(), rtol=0.01)
     assert np.allclose(2 * a.depth, b.depth, rtol=1e-4)
 
@@ -422,11 +420,11 @@ def test_cycles_mode_clamps_filters_and_limits(jit):
     assert 0.37 < offsets.std() < 0.42  # the window's standard deviation, in pixels
     scene = clutter(cameras=1)
     kept = {"max_spp": 64, "seed": 0, "backend": jit, "denoise": False}
-    physical, cycles = (render_views(scene, 16, mode=mode, **kept)[0] for mode in ("physical", "cycles"))
+    physical, cycles = (path_traced(scene, 16, mode=mode, **kept)[0] for mode in ("physical", "cycles"))
     assert np.allclose(physical.direct.mean(), cycles.direct.mean(), rtol=0.05)
     assert cycles.image.mean() < 1.02 * physical.image.mean()
     with pytest.raises(UserError, match="JIT"):
-        render_views(scene, 8, max_spp=1, seed=0, backend=SCALAR, mode="cycles")
+        path_traced(scene, 8, max_spp=1, seed=0, backend=SCALAR, mode="cycles")
 
 
 # --- against Cycles ---------------------------------------------------------------------------------------------------
@@ -442,7 +440,7 @@ def test_means_match_cycles(shared_data, jit, name, spp, tolerance):
 
     scene = load_scene(shared_data / "scenes" / f"{name}.h5")
     reference = read_rgb(shared_data / "cycles" / f"{name}-physical-128.exr")
-    image = render_views(scene, 128, max_spp=spp, seed=1, backend=jit, denoise=False, lights_visible=True)[0].image
+    image = path_traced(scene, 128, max_spp=spp, seed=1, backend=jit, denoise=False, lights_visible=True)[0].image
     ratio = np.minimum(image, 4).mean(axis=(0, 1)) / np.minimum(reference, 4).mean(axis=(0, 1))
     assert np.allclose(ratio, 1, atol=tolerance), ratio
 
@@ -455,15 +453,27 @@ def test_trace_writes_one_file_per_view(tmp_path, shared_data, monkeypatch):
 
     monkeypatch.setattr(backends, "choose", lambda choice: SCALAR)
     scene = shared_data / "scenes" / "init-template.json"
-    assert trace(scene, tmp_path / "a.exr", resolution=8, spp=2, view="all") == [tmp_path / "a-0.exr"]
+    settings = RenderSettings(8, 2)
+    assert trace(scene, tmp_path / "a.exr", settings, view="all") == [tmp_path / "a-0.exr"]
     assert read_rgb(tmp_path / "a-0.exr").shape == (8, 8, 3)
-    for arguments, message in (
-        ({"view": 3}, "1 camera"),
-        ({"out_path": "a.jpg"}, "OUT.exr"),
-        ({"spp": 0}, "at least 1"),
-    ):
-        with pytest.raises(UserError, match=message):
-            trace(**{"scene_path": scene, "out_path": tmp_path / "b.exr", "resolution": 8, **arguments})
+    with pytest.raises(UserError, match="1 camera"):
+        trace(scene, tmp_path / "b.exr", settings, view=3)
+    with pytest.raises(UserError, match=r"OUT\.exr"):
+        trace(scene, "a.jpg", settings)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"resolution": 0}, "resolution=0: expected at least 1"),
+        ({"max_spp": 0}, "max_spp=0: expected at least 1"),
+        ({"seed": -1}, "seed=-1: expected at least 0"),
+        ({"mode": "fast"}, "choose from physical, cycles"),
+    ],
+)
+def test_settings_that_cannot_be_rendered_are_refused(wrong, message):
+    with pytest.raises(UserError, match=message):
+        RenderSettings(**{"resolution": 8, "max_spp": 2, **wrong})
 
 
 def test_radiance_at_texels_is_what_a_camera_sees_of_diffuse_surfaces(jit):
@@ -484,7 +494,7 @@ def test_radiance_at_texels_is_what_a_camera_sees_of_diffuse_surfaces(jit):
         above.specular[:2] = 0
         above.camera_to_world = np.float32([camera(point + (0, 0, 0.01), point, (0, 1, 0))])
         above.fov_deg = np.float32([1])
-        view = render_views(above, 8, max_spp=256, seed=1, backend=jit, denoise=False)[0]
+        view = path_traced(above, 8, max_spp=256, seed=1, backend=jit, denoise=False)[0]
         np.testing.assert_allclose(radiance[0, :, row, column], view.lights.mean(axis=(1, 2)), rtol=0.1)
     with pytest.raises(UserError, match="JIT"):
         texel_radiance(scene, [0], spp=1, seed=0, backend=SCALAR)
@@ -502,7 +512,7 @@ def test_multiple_scattering_returns_what_single_scattering_loses(jit, roughness
     poses = [camera((0, -0.1, 2)), camera((0, -2, 0.5))]
     scene = build([(plate, 0, 1, roughness)], [(np.concatenate(sky), 1)], poses, fov=5.0)
     kept = {"max_spp": 64, "seed": 0, "backend": jit, "denoise": False, "lights_visible": True}
-    single, multiple = ([view.image.mean() for view in render_views(scene, 16, mode=m, **kept)] for m in ("physical", "cycles"))
+    single, multiple = ([view.image.mean() for view in path_traced(scene, 16, mode=m, **kept)] for m in ("physical", "cycles"))
     assert np.allclose(multiple, 1, atol=0.01)
     assert np.allclose(single, 1, atol=0.01) == (roughness < 0.3) and max(single) < 1.005
 

@@ -22,12 +22,11 @@ from stages.graphics.geometry import colours, load
 from stages.graphics.geometry.records import MeshRecord, TextureRecord
 from stages.graphics.tonemap import from_picture, to_picture
 from stages.renderformer.records import PATCH_INSIDE, PATCH_KEPT, SceneRecord, patch_means
-from stages.renderformer.rendering.render import render_views
 from stages.renderformer.s00_collect import Collect, made_up_texture
 from stages.renderformer.s03_scene import SampleScene, SceneConfig, SceneCount
 from stages.renderformer.scenes import textures
 from stages.renderformer.scenes.laws import TextureLaw
-from tests.renderformer.fakes import FakeArtifact, blob, decimated
+from tests.renderformer.fakes import FakeArtifact, blob, decimated, path_traced
 from tests.renderformer.test_collect import CORNERS, FACES, gltf, words
 from tests.renderformer.test_rendering import SCALAR, backend, build, camera, clutter, hashed, jit, quad  # noqa: F401 (fixtures)
 
@@ -433,7 +432,7 @@ def pixel_points(size):
 def test_a_textured_square_shows_its_patches_where_they_lie(backend):  # noqa: F811
     """Under light from everywhere radiance is the diffuse colour itself: two triangles, one picture, no seam."""
     scene = furnace(lambda square: patches_of(square, picture))
-    view = render_views(scene, 32, max_spp=64, seed=0, backend=backend, denoise=False)[0]
+    view = path_traced(scene, 32, max_spp=64, seed=0, backend=backend, denoise=False)[0]
     expected = picture(pixel_points(32))
     inside = np.abs(pixel_points(32)[..., [0, 2]]).max(axis=-1) < 0.45
     # clamped look-up is up to half a texel off along a triangle's first two sides, here on the diagonal
@@ -446,7 +445,7 @@ def test_specular_and_roughness_patches_act(backend):  # noqa: F811
     """Left diffuse, right specular: the same light from everywhere, but below a small lamp only the right side mirrors it."""
     share = {"specular": lambda p: 0.9 * (p[..., 0] > 0), "roughness": lambda p: np.where(p[..., 2] > 0, 0.7, 0.1)}
     scene = furnace(lambda square: patches_of(square, lambda p: 0.8 * (p[..., :1] <= 0) * np.ones(3), **share))
-    view = render_views(scene, 16, max_spp=256, seed=0, backend=backend, denoise=False)[0]
+    view = path_traced(scene, 16, max_spp=256, seed=0, backend=backend, denoise=False)[0]
     left, right = slice(2, 7), slice(9, 14)
     assert np.allclose(view.albedo[2:14, left], 0.8, atol=0.01) and np.allclose(view.albedo[2:14, right], 0.9, atol=0.01)
     assert np.allclose(view.image[2:14, left].mean(), 0.8, atol=0.02)
@@ -457,7 +456,7 @@ def test_specular_and_roughness_patches_act(backend):  # noqa: F811
     lamp = np.array([[[-0.02, -2, 0], [0.02, -2, 0], [0, -2, 0.03]]])
     above = build([(square, 0.5, 0, 1)], [(lamp, 5000)], [camera((0, -1.9, 0))], fov=29.0)
     above = textured(above, [0, 1], patches_of(square, lambda p: 0.8 * (p[..., :1] <= 0) * np.ones(3), **share))
-    image = render_views(above, 16, max_spp=256, seed=0, backend=backend, denoise=False)[0].image.mean(axis=-1)
+    image = path_traced(above, 16, max_spp=256, seed=0, backend=backend, denoise=False)[0].image.mean(axis=-1)
     assert image[8:10, 8:10].mean() > 5 * image[6:8, 8:10].mean() > 5 * image[6:8, 6:8].mean() * 0.2
     assert image[2:6, 10:14].mean() > 3 * image[10:14, 10:14].mean()  # far from the mirror direction only the rough one shines
 
@@ -478,7 +477,7 @@ def test_constant_patches_change_nothing(backend):  # noqa: F811
     scene = rounded(clutter())
     faces = [0, 1, 4, 5]
     same = textured(rounded(clutter()), faces, constant_patches(scene, faces))
-    runs = [hashed(render_views(s, 16, max_spp=8, seed=2, backend=backend, denoise=False)) for s in (scene, same)]
+    runs = [hashed(path_traced(s, 16, max_spp=8, seed=2, backend=backend, denoise=False)) for s in (scene, same)]
     assert runs[0] == runs[1]
 
 
@@ -498,8 +497,8 @@ def test_the_atlas_renders_like_face_attributes(jit):  # noqa: F811
         return textured(base, faces, mixed)
 
     varied = patches_of(speck, lambda p: np.broadcast_to(FIRST[..., None], (*p.shape[:-1], 3)), FIRST * 0.5, 0.5 + FIRST / 2)
-    a = render_views(scene, size, max_spp=32, seed=2, backend=jit, denoise=False)
-    b = render_views(with_speck(varied), size, max_spp=32, seed=2, backend=jit, denoise=False)
+    a = path_traced(scene, size, max_spp=32, seed=2, backend=jit, denoise=False)
+    b = path_traced(with_speck(varied), size, max_spp=32, seed=2, backend=jit, denoise=False)
     for one, two in zip(a, b, strict=True):
         close = np.isclose(one.image, two.image, rtol=1e-3, atol=1e-4).all(axis=-1)
         assert close.mean() > 0.97  # a rounding may end a path or turn it
@@ -512,5 +511,5 @@ def test_textured_emitters_are_black(jit):  # noqa: F811
     light = int(np.flatnonzero(scene.light_index >= 0)[0])
     lit = textured(clutter(lights=1, cameras=1), [light], patches_of(scene.triangles[[light]], picture))
     lit.diffuse, lit.specular, lit.roughness = scene.diffuse, scene.specular, scene.roughness
-    runs = [hashed(render_views(s, 16, max_spp=8, seed=2, backend=jit, denoise=False)) for s in (scene, lit)]
+    runs = [hashed(path_traced(s, 16, max_spp=8, seed=2, backend=jit, denoise=False)) for s in (scene, lit)]
     assert runs[0] == runs[1]

@@ -143,6 +143,7 @@ def compare_scene(
     from stages.graphics.mitsuba.backend import choose
     from stages.renderformer.inference.renderer import Renderer
     from stages.renderformer.rendering.render import render_views
+    from stages.renderformer.rendering.settings import RenderSettings
 
     if spp < 1:
         raise UserError(f"{spp} samples per pixel: give at least 1")
@@ -151,8 +152,7 @@ def compare_scene(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         predicted = renderer.render(scene, view, resolution, composite_lights)
-    backend = choose("auto")
-    (traced,) = render_views(scene, len(predicted), max_spp=spp, seed=0, backend=backend, views=[view])
+    (traced,) = render_views(scene, RenderSettings(len(predicted), spp), choose("auto"), [view])
     names = (
         f"{path}, view {view}, path traced, {traced.meta['spp']} samples per pixel, denoised",
         "the model that ships" if checkpoint is None else str(renderer.folder),

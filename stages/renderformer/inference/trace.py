@@ -11,25 +11,21 @@ from pipeline.errors import UserError
 
 if TYPE_CHECKING:
     from stages.renderformer.inference.room import Room
+    from stages.renderformer.rendering.settings import RenderSettings
 
 
 def trace(
     scene_path: Path | str,
     out_path: Path | str,
-    resolution: int = 512,
-    spp: int = 256,
-    mode: str = "physical",
-    denoise: bool = True,
-    seed: int = 0,
+    settings: RenderSettings,
     view: int | Literal["all"] = 0,
-    lights_visible: bool = False,
     backend: str = "auto",
     triangles: int | None = None,
     room: Room | None = None,
 ) -> list[Path]:
     """Write the view (or ``OUT-0.exr``, ``OUT-1.exr`` .. for all) as linear RGB and return the files' paths.
 
-    triangles, room: of a mesh, as of ``load_scene``. lights_visible: to the camera; training images hide them.
+    triangles, room: of a mesh, as of ``load_scene``.
     """
     from stages.graphics.exr import write_rgb
     from stages.graphics.mitsuba.backend import choose
@@ -41,8 +37,6 @@ def trace(
         raise UserError(f"{out} is not an EXR file's name: give OUT.exr")
     if not out.parent.is_dir():
         raise UserError(f"the folder {out.parent} does not exist: make it first")
-    if resolution < 1 or spp < 1 or seed < 0:
-        raise UserError(f"resolution={resolution}, spp={spp}, seed={seed}: expected at least 1, 1 and 0")
     scene = load_scene(scene_path, triangles, room)
     count = len(scene.camera_to_world)
     if view != "all" and not 0 <= view < count:
@@ -50,17 +44,7 @@ def trace(
     chosen = choose(backend)
     paths = []
     for index in range(count) if view == "all" else [view]:
-        record = render_views(
-            scene,
-            resolution,
-            max_spp=spp,
-            seed=seed,
-            backend=chosen,
-            views=[index],
-            mode=mode,
-            denoise=denoise,
-            lights_visible=lights_visible,
-        )[0]
+        (record,) = render_views(scene, settings, chosen, [index])
         paths.append(out.with_name(f"{out.stem}-{index}{out.suffix}") if view == "all" else out)
         write_rgb(paths[-1], record.image)
     return paths

@@ -43,7 +43,7 @@ def cross_attention(model: Any, scene: SceneRecord, resolution: int, device: str
     from model.renderformer.layers import rotate, split_heads
     from stages.renderformer.inference.predict import predict_scene
 
-    found: list[torch.Tensor] = []
+    layer_weights: list[torch.Tensor] = []
 
     def look(layer: Any, inputs: tuple) -> None:
         x, tokens, key_rotation, ray_rotation = inputs[:4]
@@ -52,7 +52,7 @@ def cross_attention(model: Any, scene: SceneRecord, resolution: int, device: str
         query = rotate(split_heads(cross.q_norm(cross.q_proj(layer.query_norm(x))), cross.heads), ray_rotation)
         keys = rotate(keys, key_rotation)
         weights = (query @ keys.transpose(-1, -2) / query.shape[-1] ** 0.5).softmax(dim=-1)
-        found.append(weights.mean(dim=1)[0].float().cpu())
+        layer_weights.append(weights.mean(dim=1)[0].float().cpu())
 
     hooks = [layer.register_forward_pre_hook(look) for layer in model.view_transformer.transformer.layers]
     try:
@@ -60,7 +60,7 @@ def cross_attention(model: Any, scene: SceneRecord, resolution: int, device: str
     finally:
         for hook in hooks:
             hook.remove()
-    return torch.stack(found).numpy()
+    return torch.stack(layer_weights).numpy()
 
 
 def choose_bundles(triangle: np.ndarray, object_index: np.ndarray, number: int, patch: int) -> list[int]:
@@ -103,7 +103,7 @@ class Attention(Probe):
         config, scene = worker.config, worker.base(item.id)
         prediction = worker.predict(scene)  # first: it says what is wrong with a resolution
         view = worker.trace(scene)
-        drawn = worker.trace(scene, config.drawn_px, max_spp=1, target_error=0.0, denoise=False).triangle
+        drawn = worker.trace(scene, resolution=config.drawn_px, max_spp=1, target_error=0.0, denoise=False).triangle
         patch = worker.model.config.patch_size
         bundles = choose_bundles(view.triangle, scene.object_index, config.bundles, patch)
         weights = cross_attention(worker.model, scene, config.resolution, worker.device)[:, bundles]
@@ -145,8 +145,8 @@ class Attention(Probe):
         columns = ["layer", "on registers %", "on the bundle's own triangles %", "on lights %", "effective number of tokens"]
         rows = []
         for layer in range(worker.model.config.view_transformer_n_layers):
-            mine = [row for fact in facts for row in fact["weights"] if row["layer"] == layer]
-            means = {name: np.mean([row[name] for row in mine]) for name in ("registers", "own", "lights", "effective")}
+            of_layer = [row for fact in facts for row in fact["weights"] if row["layer"] == layer]
+            means = {name: np.mean([row[name] for row in of_layer]) for name in ("registers", "own", "lights", "effective")}
             shares = [f"{100 * means[name]:.1f}" for name in ("registers", "own", "lights")]
             rows.append([str(layer + 1), *shares, f"{means['effective']:.0f}"])
         triangles = np.mean([fact["triangles"] for fact in facts])

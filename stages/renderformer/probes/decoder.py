@@ -63,8 +63,8 @@ def fit_decoder(samples: list[tuple[Tensor, Tensor, dict[str, np.ndarray]]], con
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=config.steps + 1, pct_start=0.1)
         for _ in range(config.steps):
             chosen = torch.randint(len(tokens), (min(config.batch, len(tokens)),))
-            there = met[chosen][..., None]
-            loss = ((decoder(tokens[chosen], registers[chosen]) - target[chosen]).abs() * there).sum() / (3 * there.sum())
+            valid = met[chosen][..., None]
+            loss = ((decoder(tokens[chosen], registers[chosen]) - target[chosen]).abs() * valid).sum() / (3 * valid.sum())
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

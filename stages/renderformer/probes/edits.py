@@ -64,7 +64,7 @@ def with_fov(scene: SceneRecord, degrees: float) -> SceneRecord:
 def with_lights(scene: SceneRecord, triangles: np.ndarray, radiance: np.ndarray, number: np.ndarray) -> SceneRecord:
     """The scene lit by other lights: (N, 3, 3) triangles of (N, 3) radiance; ``number`` (N,): which light each belongs to."""
     solid = rows(scene, scene.light_index < 0)
-    told = [entry for entry in scene.meta["objects"] if entry["kind"] != "light"]
+    entries = [entry for entry in scene.meta["objects"] if entry["kind"] != "light"]
     kept = [index for index, entry in enumerate(scene.meta["objects"]) if entry["kind"] != "light"]
     place_of = np.zeros(len(scene.meta["objects"]), np.int16)
     place_of[kept] = np.arange(len(kept))
@@ -86,11 +86,11 @@ def with_lights(scene: SceneRecord, triangles: np.ndarray, radiance: np.ndarray,
     if solid.patch_index is not None:
         arrays["patch_index"] = np.concatenate([solid.patch_index, np.full(count, -1)])
     dtypes = SceneRecord.DTYPES | SceneRecord.PATCH_DTYPES
-    told += [
+    entries += [
         {"name": f"light_{light}", "kind": "light", "faces": int((np.asarray(number) == light).sum())}
         for light in range(int(np.max(number)) + 1)
     ]
-    meta = {**scene.meta, "objects": told, "n_lights": int(np.max(number)) + 1}
+    meta = {**scene.meta, "objects": entries, "n_lights": int(np.max(number)) + 1}
     return replace(scene, **{name: values.astype(dtypes[name]) for name, values in arrays.items()}, meta=meta)
 
 
@@ -247,9 +247,9 @@ def with_rung(scene: SceneRecord, name: str, now: meshes.Mesh, new: meshes.Mesh,
     out.vertex_normals[part] = meshes.smooth_normals(vertices, faces, groups)
     for array in ("diffuse", "specular", "roughness"):
         getattr(out, array)[part] = np.average(getattr(scene, array)[mine], axis=0, weights=weights)
-    told = list(scene.meta["objects"])
-    told[index] = {**entry, "faces": len(faces)}
-    return replace(out, meta={**scene.meta, "objects": told})
+    entries = list(scene.meta["objects"])
+    entries[index] = {**entry, "faces": len(faces)}
+    return replace(out, meta={**scene.meta, "objects": entries})
 
 
 # --- surfaces ---------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -25,6 +25,7 @@ from stages.graphics.arrays import pack_json, unpack_json
 from stages.graphics.metrics import METRICS, Metric
 from stages.renderformer.probes import edits
 from stages.renderformer.records import SceneRecord
+from stages.renderformer.rendering.settings import RenderSettings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -107,19 +108,14 @@ class Worker:
             raise UserError(f"the model's prediction of scene {scene.id} holds NaN or infinity: training has diverged")
         return image
 
-    def trace(self, scene: SceneRecord, resolution: int | None = None, **options: Any) -> ViewRecord:
-        """The scene's first camera, path traced as the config says."""
+    def trace(self, scene: SceneRecord, **changes: Any) -> ViewRecord:
+        """The scene's first camera, path traced as the config says but for ``changes``: fields of `RenderSettings`."""
         from stages.renderformer.rendering.render import render_views
 
-        config = self.config
+        config, seed = self.config, seed_for(self.config.seed, "probe/trace", scene.id)
+        settings = replace(RenderSettings(config.resolution, config.max_spp, seed, config.target_error), **changes)
         threads = os.environ.get("LIGHTMILL_THREADS")  # set by the engine in worker processes
-        settings = {
-            "max_spp": config.max_spp,
-            "target_error": config.target_error,
-            "seed": seed_for(config.seed, "probe/trace", scene.id),
-            "threads": int(threads) if threads else None,
-        }
-        return render_views(scene, resolution or config.resolution, backend=self.renderer, views=[0], **settings | options)[0]
+        return render_views(scene, settings, self.renderer, [0], int(threads) if threads else None)[0]
 
     def rng(self, purpose: str, scene_id: str) -> np.random.Generator:
         """Random numbers of a scene, the same for every value of the setting."""
@@ -142,18 +138,18 @@ class Probe:
 
     def scene_ids(self, config: Any, inputs: Inputs) -> list[str]:
         """The scenes that the probe works on."""
-        shard, found = inputs["shard"], []
+        shard, scene_ids = inputs["shard"], []
         for scene_id in shard.ids(config.split):
             if self.suits(unpack_json(shard.read(scene_id, ("meta.json",)).members["meta.json"])):
-                found.append(scene_id)
-                if len(found) == config.scenes:
+                scene_ids.append(scene_id)
+                if len(scene_ids) == config.scenes:
                     break
-        if not found:
+        if not scene_ids:
             raise UserError(
                 f"probe={self.name}: the {config.split} split has {len(shard.ids(config.split))} scenes and none of them "
                 "suits this probe: make more scenes (scene.count), or choose another probe.split"
             )
-        return found
+        return scene_ids
 
     def items(self, config: Any, inputs: Inputs) -> Iterator[Item]:
         raise NotImplementedError
@@ -221,7 +217,7 @@ class Sweep(Probe):
         value = {slug(value): value for value in config.values}[name]
         resolution = self.resolution(config, value)
         scene = self.scene(worker, scene_id, value)
-        view = worker.trace(scene, resolution)
+        view = worker.trace(scene, resolution=resolution)
         if view.meta["status"] == "too_close":
             raise Reject("too_close", f"nearest {view.meta['nearest']}")
         if not view.image.any():

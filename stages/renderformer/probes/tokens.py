@@ -70,7 +70,9 @@ class Tokens(Probe):
         config, scene = worker.config, worker.base(item.id)
         arrays = {}
         if item.group == config.split:
-            arrays["seen"] = worker.trace(scene, config.drawn_px, max_spp=1, target_error=0.0, denoise=False).triangle
+            arrays["seen"] = worker.trace(
+                scene, resolution=config.drawn_px, max_spp=1, target_error=0.0, denoise=False
+            ).triangle
             faces = np.unique(arrays["seen"][arrays["seen"] >= 0])
         else:
             faces = worker.rng("tokens", item.id).permutation(len(scene.triangles))
@@ -142,28 +144,28 @@ class Tokens(Probe):
         figure = new_figure(len(ids) * (side + 3 * small + 0.75))
         outer = figure.add_gridspec(2 * len(ids), 1, height_ratios=[side + 0.3, 3 * small + 0.3] * len(ids))
         for number, id in enumerate(ids):
-            told, scene = truth[id], scenes[id]
-            sheets = [log_decode(told["radiance"].astype(np.float32)), *(log_decode(decoded[name][id]) for name in names)]
-            sheets = [np.where(told["met"][..., None], sheet, 0) for sheet in sheets]
-            drawn = [draw_textures(scene, told["seen"], told["faces"], sheet) for sheet in sheets]
+            texels, scene = truth[id], scenes[id]
+            sheets = [log_decode(texels["radiance"].astype(np.float32)), *(log_decode(decoded[name][id]) for name in names)]
+            sheets = [np.where(texels["met"][..., None], sheet, 0) for sheet in sheets]
+            drawn = [draw_textures(scene, texels["seen"], texels["faces"], sheet) for sheet in sheets]
             exposure = exposure_for(drawn[0])
-            picture = worker.trace(scene, config.drawn_px).image
+            picture = worker.trace(scene, resolution=config.drawn_px).image
             top = outer[2 * number].subgridspec(1, len(titles))
             for column, image in enumerate([picture, *drawn]):
                 axes = figure.add_subplot(top[column])
                 show_picture(axes, to_picture(image, exposure), titles[column] if number == 0 else "")
             # triangles that vary most within themselves among those that are large in the picture
-            pixels = np.array([(told["seen"] == face).sum() for face in told["faces"]])
-            whole = told["met"].sum(axis=(1, 2)) >= 0.9 * told["met"].sum(axis=(1, 2)).max()
-            spread = np.where(told["met"], told["radiance"].astype(np.float32).mean(axis=-1), np.nan)
+            pixels = np.array([(texels["seen"] == face).sum() for face in texels["faces"]])
+            whole = texels["met"].sum(axis=(1, 2)) >= 0.9 * texels["met"].sum(axis=(1, 2)).max()
+            spread = np.where(texels["met"], texels["radiance"].astype(np.float32).mean(axis=-1), np.nan)
             large = np.flatnonzero(whole & (pixels >= np.percentile(pixels[whole], 50)))
             order = large[np.argsort(-np.nan_to_num(np.nanstd(spread[large], axis=(1, 2))), kind="stable")][:SWATCHES]
             below = outer[2 * number + 1].subgridspec(3, SWATCHES)
             for column, face in enumerate(order):
-                brightest = exposure_for(sheets[0][face][told["met"][face]])
+                brightest = exposure_for(sheets[0][face][texels["met"][face]])
                 for row, (sheet, name) in enumerate(zip(sheets, ("truth", "entering", "leaving"), strict=True)):
                     swatch = to_picture(sheet[face], brightest)
-                    swatch[kept & ~told["met"][face]] = 205
+                    swatch[kept & ~texels["met"][face]] = 205
                     swatch[~kept] = 255
                     show_picture(figure.add_subplot(below[row, column]), swatch, row="" if column else name)
         return figure

@@ -102,12 +102,12 @@ class Guide(Unguided):
     def learn(self, views):
         light = self.light.numpy().reshape(-1, CELLS, HEIGHTS, TURNS)
         for view in views:
-            mine = light[view].astype(np.float64)
-            around = np.pad(mine, ((0, 0), (1, 1), (0, 0)))
-            beside = np.roll(mine, 1, axis=-1) + np.roll(mine, -1, axis=-1)
-            mine = (mine + SPREAD * (around[:, 2:] + around[:, :-2] + beside)).reshape(CELLS, BINS)
-            total = mine.sum(axis=1, keepdims=True)
-            shares = mine / np.where(total > 0, total, 1)
+            learned = light[view].astype(np.float64)
+            around = np.pad(learned, ((0, 0), (1, 1), (0, 0)))
+            beside = np.roll(learned, 1, axis=-1) + np.roll(learned, -1, axis=-1)
+            learned = (learned + SPREAD * (around[:, 2:] + around[:, :-2] + beside)).reshape(CELLS, BINS)
+            total = learned.sum(axis=1, keepdims=True)
+            shares = learned / np.where(total > 0, total, 1)
             cells = slice(view * CELLS, (view + 1) * CELLS)
             self._tables[:, cells] = shares, np.cumsum(shares.astype(np.float32), axis=1, dtype=np.float64)
         self._publish()

@@ -34,9 +34,9 @@ class LightTable:
 
     def __init__(self, scene: SceneRecord, first: int):
         index = scene.light_index.astype(np.int64)
-        mine = (index >= first) & (index < first + SLOTS)
-        slot = np.where(mine, index - first, np.where(index >= 0, OTHER, -1))
-        emission = np.where(mine[:, None], scene.emission, 0).astype(np.float32)
+        in_table = (index >= first) & (index < first + SLOTS)
+        slot = np.where(in_table, index - first, np.where(index >= 0, OTHER, -1))
+        emission = np.where(in_table[:, None], scene.emission, 0).astype(np.float32)
         cross = normal_vectors(scene.triangles.astype(np.float64))
         length = np.linalg.norm(cross, axis=1)
         power = emission.sum(axis=1, dtype=np.float64) * length

@@ -72,5 +72,5 @@ def noise_floor(pairs: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _distribution(values: Sequence[float], digits: int) -> dict[str, float]:
-    told = {"mean": np.mean(values)} | {f"p{percent}": np.percentile(values, percent) for percent in PERCENTS}
-    return {name: round(float(value), digits) for name, value in told.items()}
+    summary = {"mean": np.mean(values)} | {f"p{percent}": np.percentile(values, percent) for percent in PERCENTS}
+    return {name: round(float(value), digits) for name, value in summary.items()}

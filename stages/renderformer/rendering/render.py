@@ -22,10 +22,10 @@ from stages.graphics.denoising import denoise as denoise_layer
 from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.records import SceneRecord, ViewRecord
 from stages.renderformer.rendering.error import Judge
+from stages.renderformer.rendering.settings import RenderSettings
 from stages.renderformer.rendering.sums import Sums
 from stages.renderformer.views import clamped_values
 
-MODES = ("physical", "cycles")
 FIRST_SPP = 16  # before the first estimate
 FAR = 2.0  # times the target: a view whose first estimate is beyond loses its first samples, taken without guiding
 MIN_MEAN = 0.01  # mean radiance under which a view is dark
@@ -34,34 +34,18 @@ MIN_DEPTH = 0.01  # nearest distance, scene units, under which a view is too clo
 
 def render_views(
     scene: SceneRecord,
-    resolution: int,
-    *,
-    max_spp: int,
-    seed: int,
+    settings: RenderSettings,
     backend: dict[str, Any],
-    target_error: float = 0.0,
     views: Sequence[int] | None = None,
-    mode: str = "physical",
-    max_depth: int = 34,
-    denoise: bool = True,
-    lights_visible: bool = False,
     threads: int | None = None,
 ) -> list[ViewRecord]:
-    """Path trace ``views`` (indices of cameras; None: all) of a scene at ``resolution`` x ``resolution`` pixels.
+    """Path trace ``views`` (indices of cameras; None: all) of a scene.
 
-    max_spp: camera paths per pixel for the image with all lights on, at most. The JIT integrator shares each path among all
-        lights; the scalar one gives each light its share of the paths.
-    target_error: a view gets 16 samples, then 32, 48, 64, 96, 128, 192 .. until its estimated error
-        (``stages.renderformer.rendering.error``) is at most this, from the second portion on guided by what the first has found
-        (``stages.renderformer.rendering.guiding``); 0: ``max_spp`` at once, no guiding, and no estimate.
-    backend: from ``stages.graphics.mitsuba.backend.choose``. max_depth: longest path in segments; 2 is direct light only.
-    lights_visible: whether camera rays see lights (reflections always do).
+    backend: from ``stages.graphics.mitsuba.backend.choose``. threads: of this process; None: all cores.
     """
-    if mode not in MODES:
-        raise UserError(f"mode={mode!r} is unknown: choose from {', '.join(MODES)}")
     backends.activate(backend, threads)
-    guided = target_error > 0 and max_spp > FIRST_SPP  # else there is no second portion to guide
-    renderer = _renderer(scene, resolution, seed, backend, mode, max_depth, lights_visible, guided)
+    target_error, max_spp, denoise = settings.target_error, settings.max_spp, settings.denoise
+    renderer = _renderer(scene, settings, backend)
     records = {}
     active = list(range(len(scene.camera_to_world))) if views is None else list(views)
     order, taken = list(active), 0
@@ -79,14 +63,14 @@ def render_views(
         taken += step
         left = []
         for view, new in zip(active, zip(*sampled, strict=True), strict=True):
-            mine = parts[view] = (
+            of_streams = parts[view] = (
                 [before + more for before, more in zip(parts[view], new, strict=True)] if parts[view] else list(new)
             )
             if 1.5 * taken <= due[view] and taken < total:  # even the next count would not do
                 left.append(view)
                 continue
-            sums = functools.reduce(operator.add, mine)
-            whole, *halves = (part.view(scene.object_index) for part in (sums, *mine))
+            sums = functools.reduce(operator.add, of_streams)
+            whole, *halves = (part.view(scene.object_index) for part in (sums, *of_streams))
             quality, error = "high" if denoise else None, None
             if len(halves) > 1:
                 quality, error = judges[view].error(*halves, whole)
@@ -98,7 +82,7 @@ def render_views(
             if renderer.guided and taken == step and total >= 2 * taken and error > FAR * target_error:
                 parts[view] = []  # guided samples are so much better that these would only harm
             else:  # no error falls faster than by the square root, and denoised ones do not reach it
-                due[view] = taken + ((error / target_error) ** (2.5 if denoise else 2.0) - 1) * mine[0].spp
+                due[view] = taken + ((error / target_error) ** (2.5 if denoise else 2.0) - 1) * of_streams[0].spp
         active, step = left, min(_next(taken) - taken, total - taken)
     return [records[view] for view in order]
 
@@ -111,29 +95,22 @@ def _next(samples: int) -> int:
     return samples * 3 // 2 if power_of_two else samples * 4 // 3
 
 
-def _renderer(
-    scene: SceneRecord,
-    resolution: int,
-    seed: int,
-    backend: dict[str, Any],
-    mode: str,
-    max_depth: int,
-    lights_visible: bool,
-    guided: bool,
-) -> Any:
+def _renderer(scene: SceneRecord, settings: RenderSettings, backend: dict[str, Any]) -> Any:
     """A ``ScalarRenderer`` or ``JitRenderer``; guided where it can be and nothing is clamped."""
+    resolution, seed, depth, lights_visible = settings.resolution, settings.seed, settings.max_depth, settings.lights_visible
     if backend["backend"] == "scalar":
-        if mode == "cycles":
+        if settings.mode == "cycles":
             raise UserError("mode=cycles needs a JIT backend of Mitsuba, and none works here: " + backends.INSTALL)
         from stages.renderformer.rendering.scalar import ScalarRenderer
 
-        return ScalarRenderer(scene, resolution, seed, max_depth, lights_visible)
+        return ScalarRenderer(scene, resolution, seed, depth, lights_visible)
     from stages.renderformer.rendering.jit import JitRenderer, Limits
 
-    if mode == "physical":
-        return JitRenderer(scene, resolution, seed, Limits(max_depth - 1), lights_visible, guided)
+    if settings.mode == "physical":
+        guided = settings.target_error > 0 and settings.max_spp > FIRST_SPP  # else there is no second portion to guide
+        return JitRenderer(scene, resolution, seed, Limits(depth - 1), lights_visible, guided)
     # Cycles lets light in at the hit behind the last counted bounce, hence 12 + 1.
-    bounces = min(max_depth - 1, 13)
+    bounces = min(depth - 1, 13)
     limits = Limits(bounces, 4, 4, 10.0, "blackman-harris", glossy_filter=True, multiscatter=True)
     return JitRenderer(scene, resolution, seed, limits, lights_visible)
 

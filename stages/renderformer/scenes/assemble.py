@@ -99,12 +99,12 @@ def _reflectance(
     return diffuse, np.repeat(specular[:, None], 3, axis=1), roughness
 
 
-def _told(placement: Placement) -> dict:
+def _placement_json(placement: Placement) -> dict:
     """A placement as the scene's meta tells it; what only concerns textures is left out where there is none."""
-    told = {key: value for key, value in asdict(placement).items() if key not in ("index", "shape")}
+    fields = {key: value for key, value in asdict(placement).items() if key not in ("index", "shape")}
     if placement.texture is None:
-        del told["texture"], told["material"]["bound"]
-    return told
+        del fields["texture"], fields["material"]["bound"]
+    return fields
 
 
 def assemble(
@@ -151,7 +151,7 @@ def assemble(
             names = ("diffuse", "specular", "roughness")
             reflectance = dict(zip(names, _reflectance(law, placement, groups, len(faces)), strict=True))
         add(
-            _told(placement),
+            _placement_json(placement),
             triangles=vertices[faces],
             vertex_normals=meshes.smooth_normals(vertices, faces, groups),
             **reflectance,

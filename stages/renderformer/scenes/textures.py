@@ -132,9 +132,9 @@ def nearest_colours(
         look = material[face]
         out = texture.colour[look].astype(np.float32)
         for row in np.flatnonzero(texture.image >= 0):
-            mine = look == row
-            if mine.any():
-                out[mine] *= look_up(texture.images[texture.image[row]], where[mine], tuple(texture.wrap[row]))
+            of_look = look == row
+            if of_look.any():
+                out[of_look] *= look_up(texture.images[texture.image[row]], where[of_look], tuple(texture.wrap[row]))
         return out
 
     return colours

@@ -45,7 +45,7 @@ def camera(position: np.ndarray, look_at: tuple[float, float, float], fov_deg: f
     return Camera(place, list(look_at), float(np.linalg.norm(position - look_at)), place, [0.0, 0.0, 1.0], fov_deg)
 
 
-class Made(Sweep):
+class BuiltScenes(Sweep):
     """Scenes of the probe's own; the config's ``scenes`` says how many."""
 
     def scene_ids(self, config: Any, inputs: Inputs) -> list[str]:
@@ -93,7 +93,7 @@ def plates(number: int, angle: float) -> meshes.Mesh:
     return vertices, faces.reshape(-1, 3)
 
 
-class Occluders(Made):
+class Occluders(BuiltScenes):
     name = "occluders"
     title = "Occluders"
     question = "How fine may the shadow of many occluders between a light and the floor be?"
@@ -135,7 +135,7 @@ class BouncesConfig(ProbeConfig):
 MIRRORS = ("back", "right", "left")  # in the order in which walls become mirrors
 
 
-class Bounces(Made):
+class Bounces(BuiltScenes):
     name = "bounces"
     title = "Specular bounces"
     question = "Does the network follow light over one, two and more mirrors?"

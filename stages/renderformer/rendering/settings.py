@@ -1,0 +1,42 @@
+"""What decides the pixels of a path-traced view, beside the scene and the backend."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pipeline.errors import UserError
+
+MODES = ("physical", "cycles")
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """One object for the render stage, the probes, ``lightmill trace`` and ``lightmill compare``.
+
+    resolution: pixels per side. seed: of all random numbers.
+    max_spp: camera paths per pixel for the image with all lights on, at most. The JIT integrator shares each path among all
+        lights; the scalar one gives each light its share of the paths.
+    target_error: bound on the estimated error of a view (``stages.renderformer.rendering.error``). A view gets 16 samples, then
+        32, 48, 64, 96, 128, 192 .. until it is met. From the second portion on, paths are guided by what the first found
+        (``stages.renderformer.rendering.guiding``). 0: ``max_spp`` at once, no guiding and no estimate.
+    mode: ``physical`` or ``cycles`` (``stages.renderformer.rendering.render``).
+    max_depth: longest path in segments; 2 is direct light only.
+    denoise: Open Image Denoise, every light on its own.
+    lights_visible: whether camera rays see lights; reflections always do.
+    """
+
+    resolution: int
+    max_spp: int
+    seed: int = 0
+    target_error: float = 0.0
+    mode: str = "physical"
+    max_depth: int = 34
+    denoise: bool = True
+    lights_visible: bool = False
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise UserError(f"mode={self.mode!r} is unknown: choose from {', '.join(MODES)}")
+        for name, least in (("resolution", 1), ("max_spp", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise UserError(f"{name}={getattr(self, name)}: expected at least {least}")
