@@ -188,4 +188,4 @@ def given_mesh(capture: Artifact) -> Mesh | None:
 
 def load_atlas(path: Path) -> AtlasMesh:
     arrays = unpack_arrays(path.read_bytes())
-    return AtlasMesh(**{**arrays, "width": int(arrays["width"]), "height": int(arrays["height"])})
+    return AtlasMesh(**{**arrays, "width": arrays["width"].item(), "height": arrays["height"].item()})

@@ -89,7 +89,7 @@ class Atlas(MapStage):
         parts = []
         for row in draft.rows():
             arrays = unpack_arrays(draft.read(row.id).members["tile.npz"])
-            parts.append(unfold.Tile(**{**arrays, "width": int(arrays["width"]), "height": int(arrays["height"])}))
+            parts.append(unfold.Tile(**{**arrays, "width": arrays["width"].item(), "height": arrays["height"].item()}))
         if not parts:
             raise UserError("no tile could be unfolded: see the rejects")
         atlas = unfold.pack(parts, config.padding, config.size)
