@@ -7,217 +7,31 @@ and the data, so a run that was killed goes on from its last checkpoint to the s
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors import safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from model.errors import InputError
 from model.files import replace
-from model.neuras import shading, skyboxes
 from model.neuras.baked import Baked
-from model.neuras.maps import Maps, blocks, voxels
-from model.neuras.quantization import clusters, nearest, straight_through
+from model.neuras.quantization import straight_through
 from model.neuras.rays import Batch, Pixels, View
-from model.neuras.sampling import bilinear, gather
-from model.neuras.shading import ShaderConfig
+from model.neuras.sampling import gather
+from model.neuras.scene import FitConfig, Scene, Surroundings
+from model.training.logs import TrainingLog
 
-CHUNK = 1 << 16  # rays at a time where nothing is learned
-MEAN_LEVELS = 4  # cells beyond the shared ones, each four times as wide, from which unseen texels are filled
-
-
-@dataclass(frozen=True)
-class FitConfig:
-    """How to fit. Lengths are in world units; the paper's lambdas and beta are in a supplement that was not seen."""
-
-    steps: int
-    seed: int = 0
-    shader: ShaderConfig = ShaderConfig()
-    patch: int = 8  # pixels along a patch
-    patches: int = 128  # of a step
-    lr: float = 0.01  # of textures and codes
-    network_lr: float = 0.003
-    final_lr: float = 0.1  # share of both that the cosine ends at
-    codes: int = 1024  # of each codebook; 0: no quantization
-    quantize_from: float = 0.0  # share of the steps before quantization begins
-    vq: float = 0.1  # lambda_vq
-    commitment: float = 0.25  # beta
-    perceptual: float = 0.0  # lambda_perc
-    shared_levels: int = 2  # coarse levels
-    voxel: float = 0.3  # edge of the finest voxel that texels of the mesh share
-    block: int = 4  # texels along the finest block that texels of a skybox share
-    sky_side: int = 256  # texels along a face of a skybox
-    near_opacity: float = 0.12  # of all skyboxes but the farthest, at the start: far layers explain first
-    direction_noise: float = 0.0  # sigma added to the view direction
-    # Runtime: these do not change the result, or only its rounding
-    compile: bool = False
-    mixed_precision: bool = False
-    log_every: int = 20
-    validate_every: int = 0  # steps; 0: at the end alone
-    checkpoint_every: int = 50
-
-    RUNTIME = ("compile", "mixed_precision", "log_every", "validate_every", "checkpoint_every")
-
-    def identity(self) -> dict[str, Any]:
-        return {name: value for name, value in dataclasses.asdict(self).items() if name not in self.RUNTIME}
-
-
-@dataclass(frozen=True, eq=False)
-class Surroundings:
-    """What the textures lie on. positions: (H, W, 3) float32, world, of the texels that ``inside`` (H, W) bool says a
-    bilinear sample can reach. sky_centre: (3,), sky_half_sizes: (L, 3), float64, world.
-    """
-
-    positions: np.ndarray
-    inside: np.ndarray
-    sky_centre: np.ndarray
-    sky_half_sizes: np.ndarray
-
-
-class Scene:
-    """Everything that is learned, and how rays are rendered from it."""
-
-    def __init__(self, config: FitConfig, surroundings: Surroundings, pixels: Pixels):
-        self.config, self.surroundings = config, surroundings
-        self.height, self.width = surroundings.inside.shape
-        self.layers = len(surroundings.sky_half_sizes)
-        self.half = torch.from_numpy(surroundings.sky_half_sizes.astype(np.float32))
-        generator = torch.Generator().manual_seed(config.seed)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            self.mesh_shader, self.sky_shader = shading.MeshShader(config.shader), shading.SkyShader(config.shader)
-        self.maps = self._start(pixels)
-        self.codes: dict[str, Tensor] = {}
-        if config.codes:
-            for name, maps in self.maps.items():
-                rows = torch.randint(maps.count, (min(maps.count, 20 * config.codes),), generator=generator)
-                sample = maps.features(rows)
-                self.codes[name] = clusters(sample, config.codes, 8, generator).requires_grad_()
-
-    def _start(self, pixels: Pixels) -> dict[str, Maps]:
-        """Maps of the texels that training rays touch, their features started from the mean colours of those rays."""
-        side, channels = self.config.sky_side, self.config.shader.channels
-        totals = {"mesh": self.height * self.width, "sky": self.layers * 6 * side * side}
-        sums = {name: torch.zeros(total, 4) for name, total in totals.items()}
-        for batch in pixels.everything(CHUNK):
-            for name, (texels, weights, rays) in self.places(batch).items():
-                used = weights + 1e-6  # a texel of weight 0 is named too
-                colours = torch.cat([batch.rgb[rays], torch.ones(len(rays), 1)], dim=1)
-                sums[name].index_add_(0, texels.reshape(-1), (used[:, :, None] * colours[:, None, :]).reshape(-1, 4))
-        cells = {"mesh": self._voxels(), "sky": self._blocks()}
-        maps = {}
-        for name, total in sums.items():
-            touched = total[:, 3] > 0
-            start = torch.zeros(int(touched.sum()), channels)
-            start[:, :3] = total[touched, :3] / total[touched, 3:]
-            if name == "sky":
-                farthest = torch.nonzero(touched)[:, 0] >= (self.layers - 1) * 6 * side * side
-                near = math.log(self.config.near_opacity / (1 - self.config.near_opacity))
-                start[:, shading.OPACITY] = torch.where(farthest, 4.0, near)
-            maps[name] = Maps(touched.numpy(), cells[name], self.config.shared_levels, start)
-        return maps
-
-    def _voxels(self) -> list[np.ndarray]:
-        """Cells of the mesh's texels; those that no sample reaches are all in cell 0."""
-        inside = self.surroundings.inside.reshape(-1)
-        found = []
-        for level in range(self.config.shared_levels + MEAN_LEVELS):
-            cells = np.zeros(len(inside), np.int64)
-            cells[inside] = voxels(self.surroundings.positions.reshape(-1, 3)[inside], self.config.voxel * 4**level)
-            found.append(cells)
-        return found
-
-    def _blocks(self) -> list[np.ndarray]:
-        edges = [self.config.block * 4**level for level in range(self.config.shared_levels + MEAN_LEVELS)]
-        side = self.config.sky_side
-        return [blocks(self.layers, side, edge) for edge in edges if edge < 4 * side]
-
-    def places(self, batch: Batch) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-        """Of mesh and sky: texels (N, 4), weights (N, 4), and the number in the batch of each sample's ray (N,).
-
-        Pixels that do not count have no samples. The sky's samples are those of rays that miss the mesh, ray after ray, near to far.
-        """
-        rays = torch.nonzero(batch.hit & batch.counts)[:, 0]
-        found = {"mesh": (*bilinear(batch.uv[rays], self.width, self.height), rays)}
-        rays = torch.nonzero(~batch.hit & batch.counts)[:, 0]
-        side, origins, directions = self.config.sky_side, batch.origins[rays], batch.directions[rays]
-        texels, weights = [], []
-        for layer in range(self.layers):
-            face, uv = skyboxes.intersect(origins, directions, self.half[layer])
-            inside, weight = bilinear(uv, side, side)
-            texels.append(inside + ((6 * layer + face) * side * side)[:, None])
-            weights.append(weight)
-        stacked = (torch.stack(parts, dim=1).reshape(-1, 4) for parts in (texels, weights))
-        return found | {"sky": (*stacked, rays.repeat_interleave(self.layers))}
-
-    def shade(self, batch: Batch, samples: dict[str, tuple[Tensor, Tensor]], directions: Tensor) -> Tensor:
-        """(B, 3) colours from the sampled features (N, D) of mesh and sky and the numbers of their rays, not clamped."""
-        features, rays = samples["mesh"]
-        rgb = torch.zeros(len(batch.hit), 3).index_copy(0, rays, self.mesh_shader(features, directions[rays]))
-        features, rays = samples["sky"]
-        if not len(rays):
-            return rgb
-        colours, opacities = self.sky_shader(features, directions[rays])
-        light = shading.composite(colours.view(-1, self.layers, 3), opacities.view(-1, self.layers))
-        return rgb.index_copy(0, rays[:: self.layers], light)
-
-    def networks(self) -> list[Tensor]:
-        return [*self.mesh_shader.parameters(), *self.sky_shader.parameters()]
-
-    def render(self, pixels: Pixels) -> list[np.ndarray]:
-        """(H, W, 3) float32 in [0, 1] of every view, as the baked maps will show it."""
-        tables = {}
-        for name, maps in self.maps.items():
-            tables[name] = maps.features_of_all()
-        found: list[list[Tensor]] = []
-        with torch.no_grad():
-            for batch in pixels.everything(CHUNK):
-                batch = dataclasses.replace(batch, counts=torch.ones_like(batch.counts))
-                samples = {}
-                for name, (texels, weights, rays) in self.places(batch).items():
-                    rows, where = self.maps[name].row_of[texels].long().unique(return_inverse=True)
-                    values = tables[name][rows]
-                    if self.codes:
-                        values = self.codes[name][nearest(values, self.codes[name])]
-                    samples[name] = (gather(values, where, weights), rays)
-                found.append(self.shade(batch, samples, batch.directions).clamp(0, 1))
-        flat = torch.cat(found).numpy()
-        return [
-            flat[first : first + h * w].reshape(h, w, 3) for first, (h, w) in zip(pixels.first, pixels.sizes, strict=True)
-        ]
-
-    def baked(self, meta: dict[str, Any]) -> Baked:
-        """The finished scene, unseen texels filled."""
-        side, shader = self.config.sky_side, self.config.shader
-        shapes = {"mesh": (self.height, self.width), "sky": (self.layers, 6, side, side)}
-        arrays = {}
-        for name, maps in self.maps.items():
-            values, row_of = maps.features_of_all(), maps.row_of.numpy()
-            if self.codes:
-                codes = self.codes[name].detach()
-                indices = nearest(values, codes).numpy().astype(np.uint16)
-                arrays |= {f"{name}_indices": indices[row_of].reshape(shapes[name]), f"{name}_codebook": codes.numpy().copy()}
-            else:
-                arrays[f"{name}_features"] = values.numpy().astype(np.float16)[row_of].reshape(*shapes[name], -1)
-        return Baked(
-            mesh_mlp=shading.arrays(self.mesh_shader.layers),
-            sky_mlp=shading.arrays([*self.sky_shader.trunk, *self.sky_shader.layers]),
-            sky_opacity=shading.arrays([self.sky_shader.opacity])[0],
-            sky_centre=np.asarray(self.surroundings.sky_centre, np.float64),
-            sky_half_sizes=np.asarray(self.surroundings.sky_half_sizes, np.float64),
-            view_dependent=shader.view_direction and shader.layers > 0,
-            meta=meta,
-            **arrays,
-        )
+STATE = "state.safetensors"
+LOSSES = ("loss", "photometric", "perceptual", "vq")
 
 
 def rate(step: int, config: FitConfig) -> float:
@@ -226,17 +40,24 @@ def rate(step: int, config: FitConfig) -> float:
 
 
 class Trainer:
+    """A scene, its optimizer and its step. ``window``: sums of the losses, and their number, since the last line of the log."""
+
     def __init__(self, scene: Scene):
         self.scene, self.config, self.step = scene, scene.config, 0
         groups = [{"params": scene.networks(), "lr": scene.config.network_lr}]
         if scene.codes:
             groups.append({"params": list(scene.codes.values()), "lr": scene.config.lr})
-        self.optimizer = torch.optim.Adam([g | {"peak_lr": g["lr"]} for g in groups], betas=(0.9, 0.99))
+        self.optimizer = torch.optim.Adam([group | {"peak_lr": group["lr"]} for group in groups], betas=(0.9, 0.99))
+        self.window = torch.zeros(len(LOSSES) + 1, dtype=torch.float64)
+        if scene.config.compile:
+            scene.mesh_shader.compile()
+            scene.sky_shader.compile()
 
-    def train_step(self, batch: Batch) -> dict[str, float]:
+    def train_step(self, batch: Batch) -> None:
+        """One step of everything. InputError where the loss is not finite: nothing was changed then."""
         scene, config = self.scene, self.config
         quantizing = bool(scene.codes) and self.step >= config.quantize_from * config.steps
-        leaves, samples, vq = {}, {}, torch.zeros(())
+        leaves, samples, vq = {}, {}, torch.zeros((), device=scene.device)
         for name, (texels, weights, rays) in scene.places(batch).items():
             rows, where = scene.maps[name].row_of[texels].unique(return_inverse=True)
             rows = rows.long()
@@ -250,13 +71,20 @@ class Trainer:
         directions = batch.directions
         if config.direction_noise:
             generator = torch.Generator().manual_seed(config.seed * 1_000_003 + self.step)
-            noise = torch.randn(directions.shape, generator=generator) * config.direction_noise
+            noise = torch.randn(directions.shape, generator=generator).to(scene.device) * config.direction_noise
             directions = torch.nn.functional.normalize(directions + noise, dim=1)
-        difference = (scene.shade(batch, samples, directions) - batch.rgb) * batch.counts[:, None]
+        with torch.autocast(scene.device.type, torch.bfloat16, enabled=config.mixed_precision):
+            rendered = scene.shade(batch, samples, directions)
+        difference = (rendered - batch.rgb) * batch.counts[:, None]
         photometric = difference.square().mean()
-        perceptual = gradient_loss(difference, batch.patch) if config.perceptual else torch.zeros(())
+        perceptual = gradient_loss(difference, batch.patch) if config.perceptual else torch.zeros_like(photometric)
         total = photometric + config.perceptual * perceptual + config.vq * vq
+        losses = torch.stack([loss.detach() for loss in (total, photometric, perceptual, vq)]).double().cpu()
+        if not torch.isfinite(losses).all():
+            raise InputError(f"the loss of step {self.step} is not finite: try a smaller lr or network_lr")
         total.backward()
+        self.window[: len(LOSSES)] += losses
+        self.window[-1] += 1
         share = rate(self.step, config)
         for group in self.optimizer.param_groups:
             group["lr"] = share * group["peak_lr"]
@@ -266,7 +94,46 @@ class Trainer:
         for name, (rows, leaf) in leaves.items():
             if len(rows):
                 scene.maps[name].update(rows, leaf.grad, share * config.lr, self.step)
-        return {"loss": float(total), "photometric": float(photometric), "perceptual": float(perceptual), "vq": float(vq)}
+
+    def means(self) -> dict[str, float]:
+        """Mean losses since the last call."""
+        *sums, count = self.window.tolist()
+        self.window.zero_()
+        return {name: value / max(count, 1) for name, value in zip(LOSSES, sums, strict=True)}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that a step changes, by name."""
+        found = {"step": torch.tensor(self.step), "window": self.window}
+        for name, maps in self.scene.maps.items():
+            found |= {f"{name}.{level}": table.packed for level, table in enumerate(maps.tables)}
+        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        for number, parameter in enumerate(parameters):
+            found[f"parameter.{number}"] = parameter.detach()
+            for key, value in self.optimizer.state[parameter].items():
+                found[f"optimizer.{number}.{key}"] = value
+        return found
+
+    def save(self, folder: Path) -> None:
+        temporary = folder / f".{STATE}.tmp"
+        tensors = {name: value.cpu().contiguous() for name, value in self.tensors().items()}
+        save_file(tensors, temporary, {"config": json.dumps(self.config.identity(), sort_keys=True)})
+        replace(temporary, folder / STATE)
+
+    def load(self, folder: Path) -> bool:
+        """Whether there was something to go on from."""
+        if not (folder / STATE).is_file():
+            return False
+        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        for parameter in parameters:  # as after a first step, which makes them
+            zeros = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+            self.optimizer.state[parameter] = {"step": torch.tensor(0.0)} | zeros
+        with safe_open(folder / STATE, "pt") as saved:
+            if (saved.metadata() or {}).get("config") != json.dumps(self.config.identity(), sort_keys=True):
+                raise InputError(f"{folder / STATE} belongs to a run of another configuration: give it another folder")
+            for name, value in self.tensors().items():
+                value.copy_(saved.get_tensor(name))
+            self.step = int(saved.get_tensor("step"))
+        return True
 
 
 def gradient_loss(difference: Tensor, patch: int) -> Tensor:
@@ -275,10 +142,82 @@ def gradient_loss(difference: Tensor, patch: int) -> Tensor:
     ``difference``: (B, 3) prediction less truth, patch after patch.
     """
     image = difference.view(-1, patch, patch, 3).permute(0, 3, 1, 2)
-    total = torch.zeros(())
+    total = image.new_zeros(())
     for _ in range(3):
         total = total + (image[:, :, 1:] - image[:, :, :-1]).abs().mean() + (image[..., 1:] - image[..., :-1]).abs().mean()
         if min(image.shape[2:]) < 4:
             break
         image = torch.nn.functional.avg_pool2d(image, 2)
     return total
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Where a run writes and speaks. state: folder of its checkpoint and log. show(step, truths, renderings): keeps a picture of
+    the validation views, and returns it. tensorboard: folder of events.
+    """
+
+    state: Path
+    say: Callable[[str], None] = print
+    show: Callable[[int, list[np.ndarray], list[np.ndarray]], np.ndarray] | None = None
+    tensorboard: Path | None = None
+
+
+def fit(
+    config: FitConfig,
+    surroundings: Surroundings,
+    views: Sequence[View],
+    validation: Sequence[View],
+    outputs: Outputs,
+    device: str = "cpu",
+) -> tuple[Baked, dict[str, Any]]:
+    """The scene that ``views`` show, fitted, and a summary. Goes on from ``outputs.state`` if it holds a checkpoint."""
+    outputs.state.mkdir(parents=True, exist_ok=True)
+    centre = surroundings.sky_centre
+    pixels = Pixels(views, centre, config.patch, torch.device(device))
+    held_out = Pixels(validation, centre, 1, torch.device(device)) if validation else None
+    scene = Scene(config, surroundings, pixels)
+    trainer = Trainer(scene)
+    touched = {name: maps.count for name, maps in scene.maps.items()}
+    outputs.say(
+        f"{len(views)} views, {len(pixels.uv):,} pixels touch {touched['mesh']:,} texels, and {touched['sky']:,} of the sky"
+    )
+    if trainer.load(outputs.state):
+        outputs.say(f"going on from step {trainer.step:,} of {config.steps:,}")
+    log = TrainingLog(outputs.state, outputs.tensorboard, trainer.step, config.steps, outputs.say)
+    metrics: dict[str, float] = {}
+    began, first = time.perf_counter(), trainer.step
+    for batch in pixels.patches(config.seed, config.patches, trainer.step, config.steps):
+        trainer.train_step(batch)
+        step, last = trainer.step, trainer.step == config.steps
+        if step % config.log_every == 0 or last:
+            means, pace = trainer.means(), (time.perf_counter() - began) / (step - first)
+            log.row({"step": step, **means, "lr": config.lr * rate(step - 1, config)})
+            outputs.say(
+                f"step {step:>{log.width}}/{config.steps}  loss {means['loss']:.5f}  photometric {means['photometric']:.5f}  "
+                f"vq {means['vq']:.5f}  {1000 * pace:6.1f} ms a step"
+            )
+        if held_out and config.validate_every and step % config.validate_every == 0 and not last:
+            metrics = validate(scene, held_out, validation, step, log, outputs)
+        if step % config.checkpoint_every == 0 or last:
+            trainer.save(outputs.state)
+    if held_out:
+        metrics = validate(scene, held_out, validation, trainer.step, log, outputs)
+    log.close()
+    texels = {name: round(maps.count / len(maps.row_of), 4) for name, maps in scene.maps.items()}
+    return scene.baked(config.identity()), {"steps": trainer.step, "touched_share": texels} | metrics
+
+
+def validate(
+    scene: Scene, pixels: Pixels, views: Sequence[View], step: int, log: TrainingLog, outputs: Outputs
+) -> dict[str, float]:
+    """Mean PSNR over the validation views, of the pixels that count; logged, and shown."""
+    rendered = scene.render(pixels)
+    errors = [np.square(image - view.rgb / 255.0)[view.counts].mean() for image, view in zip(rendered, views, strict=True)]
+    psnr = float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
+    log.row({"step": step, "validation_psnr": round(psnr, 4)})
+    outputs.say(f"step {step:>{log.width}}/{scene.config.steps}  validation: psnr {psnr:5.2f} dB over {len(views)} views")
+    if outputs.show is not None:
+        picture = outputs.show(step, [view.rgb for view in views], rendered)
+        log.picture("validation/truth above, ours below", picture, step)
+    return {"psnr": psnr}

@@ -46,7 +46,7 @@ class Maps:
     """
 
     def __init__(self, touched: np.ndarray, cells: Sequence[np.ndarray], shared: int, start: Tensor):
-        rows = np.flatnonzero(touched)
+        rows, device = np.flatnonzero(touched), start.device
         self.count = len(rows)
         row_of = np.full(len(touched), -1, np.int32)
         row_of[rows] = np.arange(len(rows))
@@ -64,15 +64,17 @@ class Maps:
             number = np.full(len(filled), -1, np.int64)
             number[wanted] = np.arange(len(wanted))
             members = np.flatnonzero(number[level[rows]] >= 0)
-            self.means.append((torch.from_numpy(members), torch.from_numpy(last - len(rows) + number[level[rows[members]]])))
+            means = last - len(rows) + number[level[rows[members]]]
+            self.means.append((torch.from_numpy(members).to(device), torch.from_numpy(means).to(device)))
             last += len(wanted)
         self.mean_count = last - len(rows)
-        self.row_of = torch.from_numpy(row_of)
+        self.row_of = torch.from_numpy(row_of).to(device)
         self.fine = Table(start)
         self.coarse: list[tuple[Tensor, Table]] = []
         for level in cells[:shared]:
             used, cell = np.unique(level[rows], return_inverse=True)
-            self.coarse.append((torch.from_numpy(cell.reshape(-1)), Table(torch.zeros(len(used), start.shape[1]))))
+            zeros = torch.zeros(len(used), start.shape[1], device=device)
+            self.coarse.append((torch.from_numpy(cell.reshape(-1)).to(device), Table(zeros)))
 
     @property
     def tables(self) -> list[Table]:
@@ -95,9 +97,11 @@ class Maps:
 
     def features_of_all(self) -> Tensor:
         """(R + M, D): of every touched texel, and the means that ``row_of`` refers to beside them."""
-        own = torch.cat([self.features(rows) for rows in torch.arange(self.count).split(1 << 18)])
-        means, members = torch.zeros(self.mean_count, own.shape[1]), torch.zeros(self.mean_count, 1)
+        device = self.row_of.device
+        own = torch.cat([self.features(rows) for rows in torch.arange(self.count, device=device).split(1 << 18)])
+        means = torch.zeros(self.mean_count, own.shape[1], device=device)
+        members = torch.zeros(self.mean_count, 1, device=device)
         for rows, number in self.means:
             means.index_add_(0, number, own.index_select(0, rows))
-            members.index_add_(0, number, torch.ones(len(rows), 1))
+            members.index_add_(0, number, torch.ones(len(rows), 1, device=device))
         return torch.cat([own, means / members.clamp(min=1)])

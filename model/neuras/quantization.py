@@ -49,11 +49,14 @@ def clusters(rows: Tensor, count: int, rounds: int, generator: torch.Generator) 
 
     A code without rows moves to a random row.
     """
-    codes = rows[torch.randint(len(rows), (count,), generator=generator)].clone()
+
+    def drawn() -> Tensor:
+        return rows[torch.randint(len(rows), (count,), generator=generator).to(rows.device)]
+
+    codes = drawn()
     for _ in range(rounds):
         chosen = nearest(rows, codes)
         members = torch.bincount(chosen, minlength=count).unsqueeze(1)
         sums = torch.zeros_like(codes).index_add_(0, chosen, rows)
-        elsewhere = rows[torch.randint(len(rows), (count,), generator=generator)]
-        codes = torch.where(members > 0, sums / members.clamp(min=1), elsewhere)
+        codes = torch.where(members > 0, sums / members.clamp(min=1), drawn())
     return codes

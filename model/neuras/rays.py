@@ -103,9 +103,7 @@ class Pixels:
         views, corners = [], []
         for view, size in enumerate(self.sizes):
             shift = rng.integers(self.patch, size=2)
-            rows, columns = (
-                np.clip(np.arange(-shift[k], size[k], self.patch), 0, size[k] - self.patch) for k in range(2)
-            )
+            rows, columns = (np.clip(np.arange(-shift[k], size[k], self.patch), 0, size[k] - self.patch) for k in range(2))
             grid = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2)
             views.append(np.full(len(grid), view))
             corners.append(grid)
