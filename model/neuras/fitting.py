@@ -22,13 +22,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from model.errors import InputError
-from model.files import replace
 from model.neuras.baked import Baked
 from model.neuras.quantization import straight_through
 from model.neuras.rays import Batch, Pixels, View
 from model.neuras.sampling import gather
 from model.neuras.scene import FitConfig, Scene, Surroundings
 from model.training.logs import TrainingLog
+from pipeline.atomic import atomic_path
 
 STATE = "state.safetensors"
 LOSSES = ("loss", "photometric", "perceptual", "vq")
@@ -114,10 +114,9 @@ class Trainer:
         return found
 
     def save(self, folder: Path) -> None:
-        temporary = folder / f".{STATE}.tmp"
         tensors = {name: value.cpu().contiguous() for name, value in self.tensors().items()}
-        save_file(tensors, temporary, {"config": json.dumps(self.config.identity(), sort_keys=True)})
-        replace(temporary, folder / STATE)
+        with atomic_path(folder / STATE) as temporary:
+            save_file(tensors, temporary, {"config": json.dumps(self.config.identity(), sort_keys=True)})
 
     def load(self, folder: Path) -> bool:
         """Whether there was something to go on from."""
@@ -153,8 +152,8 @@ def gradient_loss(difference: Tensor, patch: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Where a run writes and speaks. state: folder of its checkpoint and log. show(step, truths, renderings): keeps a picture of
-    the validation views, and returns it. tensorboard: folder of events.
+    """Where a run writes and speaks. state: folder of its checkpoint and log. show(step, truths, renderings): keeps a picture
+    of the validation views, and returns it. tensorboard: folder of events.
     """
 
     state: Path
@@ -197,27 +196,28 @@ def fit(
                 f"step {step:>{log.width}}/{config.steps}  loss {means['loss']:.5f}  photometric {means['photometric']:.5f}  "
                 f"vq {means['vq']:.5f}  {1000 * pace:6.1f} ms a step"
             )
-        if held_out and config.validate_every and step % config.validate_every == 0 and not last:
-            metrics = validate(scene, held_out, validation, step, log, outputs)
+        if held_out and (last or (config.validate_every and step % config.validate_every == 0)):
+            metrics = validate(scene, held_out, validation, step, outputs, log)
         if step % config.checkpoint_every == 0 or last:
             trainer.save(outputs.state)
-    if held_out:
-        metrics = validate(scene, held_out, validation, trainer.step, log, outputs)
+    if held_out and not metrics:  # killed between the last step and the product: everything was done and logged already
+        metrics = validate(scene, held_out, validation, trainer.step, outputs)
     log.close()
     texels = {name: round(maps.count / len(maps.row_of), 4) for name, maps in scene.maps.items()}
     return scene.baked(config.identity()), {"steps": trainer.step, "touched_share": texels} | metrics
 
 
 def validate(
-    scene: Scene, pixels: Pixels, views: Sequence[View], step: int, log: TrainingLog, outputs: Outputs
+    scene: Scene, pixels: Pixels, views: Sequence[View], step: int, outputs: Outputs, log: TrainingLog | None = None
 ) -> dict[str, float]:
-    """Mean PSNR over the validation views, of the pixels that count; logged, and shown."""
+    """Mean PSNR over the validation views, of the pixels that count; shown, and logged where there is a ``log``."""
     rendered = scene.render(pixels)
     errors = [np.square(image - view.rgb / 255.0)[view.counts].mean() for image, view in zip(rendered, views, strict=True)]
     psnr = float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
-    log.row({"step": step, "validation_psnr": round(psnr, 4)})
-    outputs.say(f"step {step:>{log.width}}/{scene.config.steps}  validation: psnr {psnr:5.2f} dB over {len(views)} views")
-    if outputs.show is not None:
-        picture = outputs.show(step, [view.rgb for view in views], rendered)
-        log.picture("validation/truth above, ours below", picture, step)
+    outputs.say(f"step {step}/{scene.config.steps}  validation: psnr {psnr:5.2f} dB over {len(views)} views")
+    picture = None if outputs.show is None else outputs.show(step, [view.rgb for view in views], rendered)
+    if log is not None:
+        log.row({"step": step, "validation_psnr": round(psnr, 4)})
+        if picture is not None:
+            log.picture("validation/truth above, ours below", picture, step)
     return {"psnr": psnr}

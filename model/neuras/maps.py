@@ -1,6 +1,6 @@
 """A texture that is learned: one row of features per texel that a training ray touches, and coarse levels beside them.
 
-The feature of a texel is the sum of its own row and of one row of each coarse level, which all texels in the same cell share: for
+A texel's feature is the sum of its own row and of one row of each coarse level, which all texels in the same cell share: for
 the mesh a voxel of the world, for a skybox a block of its face. So what one texel learns helps those near it. A texel that no
 ray touched has the mean of the touched texels of the smallest cell that holds both.
 """

@@ -1,6 +1,6 @@
 """The pixels that a scene is fitted to, all in memory, and batches of them.
 
-A batch is made of square patches, not of single pixels: neighbours share texels, so a step touches, quantizes and updates a third
+A batch is made of square patches, not of single pixels. Neighbours share texels, so a step quantizes and updates a third
 as many rows, and differences between neighbours can be compared.
 """
 

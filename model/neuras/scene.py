@@ -138,7 +138,7 @@ class Scene:
     def places(self, batch: Batch) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
         """Of mesh and sky: texels (N, 4), weights (N, 4), and the number in the batch of each sample's ray (N,).
 
-        Pixels that do not count have no samples. The sky's samples are those of rays that miss the mesh, ray after ray, near to far.
+        Pixels that do not count have no samples. The sky's are those of rays that miss the mesh, ray after ray, near to far.
         """
         rays = torch.nonzero(batch.hit & batch.counts)[:, 0]
         found = {"mesh": (*bilinear(batch.uv[rays], self.width, self.height), rays)}

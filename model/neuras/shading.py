@@ -1,6 +1,6 @@
 """The networks that turn features into colours: three layers of 32 hidden units (section 3.2).
 
-They start as the identity on a feature's first three channels, and a skybox's opacity as the sigmoid of its fourth: so the first
+They start as the identity on the first three channels, and a skybox's opacity as the sigmoid of the fourth: so the first
 picture is made of the colours that the texels start from. ReLU lets colours through, because they are not negative.
 """
 

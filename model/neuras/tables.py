@@ -1,7 +1,7 @@
 """Rows of parameters that Adam updates only where a step touched them.
 
-A texture has millions of texels and a step touches thousands. A row keeps parameter, first and second moment side by side, because
-then one gather and one scatter move all three: half the time of indexing three arrays, a tenth of dense Adam.
+A texture has millions of texels and a step touches thousands. A row keeps parameter, first and second moment side by side,
+because then one gather and one scatter move all three: half the time of indexing three arrays, a tenth of dense Adam.
 """
 
 from __future__ import annotations

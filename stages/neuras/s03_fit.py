@@ -1,7 +1,7 @@
 """Stage fit: textures, skyboxes, codebooks and both networks, learned once per scene (sections 3.1 to 3.3).
 
-Reads capture's training and validation frames and the atlas; writes ``model.safetensors`` and ``model.json`` (``Baked``: all that
-baking needs), ``curve.csv`` and ``curve.png``, ``validation/`` (truth above, ours below) and ``tensorboard/``. What each pixel
+Reads capture's training and validation frames and the atlas; writes ``model.safetensors`` and ``model.json`` (``Baked``),
+``curve.csv`` and ``curve.png``, ``validation/`` (truth above, ours below) and ``tensorboard/``. What each pixel
 sees of the mesh is cast anew in a run that goes on: 0.05 CPU-s a frame. The loop is ``model.neuras.fitting.fit``.
 """
 
