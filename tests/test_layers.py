@@ -34,7 +34,7 @@ stages.renderformer.rendering
 stages.renderformer.dataset  stages.renderformer.scenes  stages.renderformer.objects
 stages.renderformer.views
 stages.renderformer.records
-stages.neuras.s02_atlas  stages.neuras.s04_bake
+stages.neuras.s02_atlas  stages.neuras.s03_fit  stages.neuras.s04_bake
 stages.neuras.s00_capture  stages.neuras.s01_scaffold
 stages.neuras.captures  stages.neuras.street  stages.neuras.surfaces  stages.neuras.evaluation  stages.neuras.baking
 stages.neuras.rasterizing

@@ -18,9 +18,9 @@ from safetensors.numpy import load_file, save_file
 from torch import Tensor
 
 from model.errors import InputError
-from model.files import replace
 from model.neuras.sampling import bilinear, gather
 from model.neuras.skyboxes import intersect
+from pipeline.atomic import atomic_path, write_atomic
 
 ARRAYS, VALUES = "model.safetensors", "model.json"
 FORMAT = 1  # of the two files
@@ -98,12 +98,9 @@ class Baked:
             "meta": self.meta,
         }
         folder.mkdir(parents=True, exist_ok=True)
-        temporary = folder / f".{ARRAYS}.tmp"
-        save_file({name: np.ascontiguousarray(value) for name, value in sorted(arrays.items())}, temporary)
-        replace(temporary, folder / ARRAYS)
-        temporary = folder / f".{VALUES}.tmp"
-        temporary.write_text(json.dumps(values, indent=1, sort_keys=True, allow_nan=False) + "\n")
-        replace(temporary, folder / VALUES)
+        with atomic_path(folder / ARRAYS) as temporary:
+            save_file({name: np.ascontiguousarray(value) for name, value in sorted(arrays.items())}, temporary)
+        write_atomic(folder / VALUES, (json.dumps(values, indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
 
     @classmethod
     def load(cls, folder: Path) -> Baked:

@@ -1,7 +1,8 @@
 """Bilinear samples of textures that are rows of features: which four rows, with which weights.
 
-Texel [row, column] has its centre at ((column + 0.5) / W, (row + 0.5) / H), v runs down, and what lies outside the outer centres
-takes their value: ``GL_LINEAR`` with ``GL_CLAMP_TO_EDGE``, and ``grid_sample(align_corners=False, padding_mode="border")``.
+Texel [row, column] has its centre at ((column + 0.5) / W, (row + 0.5) / H), v runs down, and what lies outside all centres
+takes the nearest value: ``GL_LINEAR`` with ``GL_CLAMP_TO_EDGE``, or
+``grid_sample(align_corners=False, padding_mode="border")``.
 """
 
 from __future__ import annotations
