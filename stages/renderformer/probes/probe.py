@@ -318,14 +318,14 @@ class Sweep(Probe):
     def _changes(self, values: Sequence[float], methods: Sequence[str], scores: Callable[..., list[float]]) -> list[str]:
         """Sentences: what the same scenes lose from the first value to the last, and how the methods compare there."""
         from stages.graphics.statistics import bootstrap
-        from stages.renderformer.evaluation.tables import told
+        from stages.renderformer.evaluation.tables import format_estimate
 
         metric, out = METRICS["psnr"], []
 
         def difference(a: tuple[str, float], b: tuple[str, float]) -> str:
             pairs = zip(scores(*a, metric.name), scores(*b, metric.name), strict=True)
-            found = bootstrap([[second - first] for first, second in pairs])
-            mean, interval = told(metric, found, "+")
+            estimate = bootstrap([[second - first] for first, second in pairs])
+            mean, interval = format_estimate(metric, estimate, "+")
             return f"{mean} dB PSNR (95 % interval {interval})"
 
         if len(values) > 1:
