@@ -10,8 +10,7 @@ SYSTEM = System(
         "atlas": "stages.neuras.s02_atlas:Atlas",
         "fit": "stages.neuras.s03_fit:Fit",
         "bake": "stages.neuras.s04_bake:Bake",
-        "evaluate": "stages.neuras.s05_evaluate:Evaluate",
     },
-    targets={"data": ("atlas",), "train": ("fit",), "eval": ("evaluate",)},
+    targets={"data": ("atlas",), "train": ("fit",), "eval": ("bake",)},
     packages=("lightmill", "torch", "mitsuba", "drjit", "pymeshlab", "xatlas", "moderngl", "numpy", "scipy", "pyoidn", "hydra-core"),
 )

@@ -112,7 +112,7 @@ def photographed(flat: AtlasMesh, baked: Baked) -> list[FrameRecord]:
             camera = scenes.looking_at(position, size=(160, 120))
             buffer = io.BytesIO()
             Image.fromarray((scene.render(camera) * 255).round().astype(np.uint8)).save(buffer, "PNG")
-            frames.append(FrameRecord(f"frame/drive_{number}", camera, buffer.getvalue(), "train"))
+            frames.append(FrameRecord(f"frame-drive_{number}", camera, buffer.getvalue(), "train"))
     return frames
 
 

@@ -5,7 +5,7 @@ index.html, *.js   the page; no build step, no network
 scene.json         sizes, formats, skyboxes, cameras of the frames, shaders' names
 geometry.glb       the mesh: POSITION relative to the skyboxes' centre, TEXCOORD_0 (v down), _CHART
 mesh_codes.png     code of each texel: low byte in R, high byte in G (quantized scenes)
-sky_codes.png      the same of the skyboxes' faces, stacked: face 6 skybox + face from the top
+sky_codes.png      the same of the skyboxes: a row of six faces for each, the nearest on top
 codebooks.bin      float32: mesh codes (K, D), then sky codes (K, D)
 mesh_I.png, ...    features of scenes without quantization: bytes in RGBA, four channels each (``ranges`` in scene.json)
 shaders/           GLSL ES 3.00 for WebGL 2 and GLSL 3.30 for engines
@@ -28,7 +28,7 @@ from PIL import Image
 from model.neuras.baked import Baked
 from stages.neuras.baking.drawing import lens
 from stages.neuras.baking.shaders import MODES, Ranges, mesh_shaders, sky_shaders, textures
-from stages.neuras.records import AtlasMesh, CaptureInfo, FrameRecord
+from stages.neuras.records import FRAME, AtlasMesh, CaptureInfo, FrameRecord
 
 PAGE = Path(__file__).parent / "page"
 
@@ -55,11 +55,11 @@ def write_site(
     _geometry(folder / "geometry.glb", atlas, baked.sky_centre)
     if baked.quantized:
         _codes(folder / "mesh_codes.png", baked.mesh_indices)
-        _codes(folder / "sky_codes.png", baked.sky_indices.reshape(-1, baked.sky_size[1]))
+        _codes(folder / "sky_codes.png", _in_rows(baked.sky_indices))
         books = [np.ascontiguousarray(book, np.float32) for book in (baked.mesh_codebook, baked.sky_codebook)]
         (folder / "codebooks.bin").write_bytes(b"".join(book.tobytes() for book in books))
     else:
-        for name, maps in (("mesh", mesh), ("sky", sky.reshape(-1, *sky.shape[3:]))):
+        for name, maps in (("mesh", mesh), ("sky", _in_rows(sky))):
             values = ranges[name].quantized(maps)
             for index in range(textures(baked.channels)):
                 part = np.ascontiguousarray(values[..., 4 * index : 4 * index + 4])
@@ -98,6 +98,12 @@ def write_site(
         if path.suffix in (".html", ".js", ".css"):
             shutil.copyfile(path, folder / path.name)
     return _sizes(folder)
+
+
+def _in_rows(maps: np.ndarray) -> np.ndarray:
+    """(L S, 6 S, ..): the faces (L, 6, S, S, ..) as one picture, a row for each skybox."""
+    layers, faces, side = maps.shape[:3]
+    return np.moveaxis(maps, 1, 2).reshape(layers * side, faces * side, *maps.shape[4:])
 
 
 def _geometry(path: Path, atlas: AtlasMesh, centre: np.ndarray) -> None:
@@ -142,7 +148,7 @@ def _codes(path: Path, codes: np.ndarray) -> None:
 
 def _view(folder: Path, frame: FrameRecord, centre: np.ndarray) -> dict[str, Any]:
     """A frame as the page knows it; its photo is written beside. World coordinates are relative to the centre."""
-    name = frame.id.removeprefix("frame/").replace("/", "_")
+    name = frame.id.removeprefix(FRAME)
     path = folder / "frames" / f"{name}.jpg"
     if frame.picture.startswith(b"\xff\xd8"):
         path.write_bytes(frame.picture)

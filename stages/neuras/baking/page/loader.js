@@ -25,6 +25,18 @@ async function pixels(blob) {
   return data;
 }
 
+// The faces of the skyboxes one after the other, from a picture with a row of six for each skybox.
+function stacked(data, { count, side }) {
+  const step = data.length / (6 * side * side * count), out = new data.constructor(data.length);
+  for (let skybox = 0; skybox < count; skybox++)
+    for (let face = 0; face < 6; face++)
+      for (let row = 0; row < side; row++) {
+        const from = step * side * (6 * (skybox * side + row) + face);
+        out.set(data.subarray(from, from + step * side), step * side * ((6 * skybox + face) * side + row));
+      }
+  return out;
+}
+
 // Positions, texture coordinates, charts and indices of a binary glTF with one mesh, as lightmill writes it.
 function readGeometry(buffer) {
   const view = new DataView(buffer), length = view.getUint32(12, true);
@@ -62,7 +74,7 @@ export async function loadScene(say) {
       return Uint16Array.from({ length: rgba.length / 4 }, (_, i) => rgba[4 * i] + 256 * rgba[4 * i + 1]);
     };
     scene.meshCodes = await codes("mesh_codes.png");
-    scene.skyCodes = await codes("sky_codes.png");
+    scene.skyCodes = stacked(await codes("sky_codes.png"), scene.skyboxes);
     const books = new Float32Array(await (await bytes("codebooks.bin")).arrayBuffer());
     const end = scene.codes.mesh * scene.channels;
     scene.books = { mesh: books.subarray(0, end), sky: books.subarray(end) };
@@ -71,7 +83,7 @@ export async function loadScene(say) {
     scene.skyMaps = [];
     for (let i = 0; i < scene.textures; i++) {
       scene.meshMaps.push(await pixels(await bytes(`mesh_${i}.png`)));
-      scene.skyMaps.push(await pixels(await bytes(`sky_${i}.png`)));
+      scene.skyMaps.push(stacked(await pixels(await bytes(`sky_${i}.png`)), scene.skyboxes));
     }
   }
   say("Preparing ..");
