@@ -34,13 +34,19 @@ stages.renderformer.rendering
 stages.renderformer.dataset  stages.renderformer.scenes  stages.renderformer.objects
 stages.renderformer.views
 stages.renderformer.records
+stages.neuras.s02_atlas  stages.neuras.s03_fit  stages.neuras.s04_bake
+stages.neuras.s00_capture  stages.neuras.s01_scaffold
+stages.neuras.captures  stages.neuras.street  stages.neuras.surfaces  stages.neuras.evaluation  stages.neuras.baking
+stages.neuras.rasterizing
+stages.neuras.records
+stages.neuras
 stages
 stages.graphics.geometry  stages.graphics.mitsuba  stages.graphics.statistics  stages.graphics.video  \
 stages.graphics.device  stages.graphics.denoising
 stages.graphics.metrics  stages.graphics.exr
-stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.page
+stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages.graphics.page
 stages.graphics
-model.renderformer
+model.renderformer  model.neuras
 model.training
 model.lpips  model.timing
 model.errors

@@ -1,0 +1,16 @@
+"""The system `neuras`, neural rasterization of large scenes: its stages in order (ICCV 2023)."""
+
+from pipeline.stage import System
+
+SYSTEM = System(
+    name="neuras",
+    modules={
+        "capture": "stages.neuras.s00_capture:Capture",
+        "scaffold": "stages.neuras.s01_scaffold:Scaffold",
+        "atlas": "stages.neuras.s02_atlas:Atlas",
+        "fit": "stages.neuras.s03_fit:Fit",
+        "bake": "stages.neuras.s04_bake:Bake",
+    },
+    targets={"data": ("atlas",), "train": ("fit",), "eval": ("bake",)},
+    packages=("lightmill", "torch", "mitsuba", "drjit", "pymeshlab", "xatlas", "moderngl", "numpy", "scipy", "pyoidn", "hydra-core"),
+)

@@ -1,0 +1,165 @@
+"""A baked scene drawn by OpenGL without a window (moderngl over EGL; software drivers do)."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+
+from model.neuras.baked import Baked
+from pipeline.errors import UserError
+from stages.graphics.cameras import Camera
+from stages.neuras.baking.shaders import MODES, Ranges, mesh_shaders, sky_shaders, textures
+from stages.neuras.records import AtlasMesh
+
+TextureFormat = Literal["fp16", "rgba8"]
+INSTALL = "install EGL and a driver, such as the packages libegl1 and libgl1-mesa-dri"
+
+
+def context() -> Any:
+    """An OpenGL 3.3 context without a window; UserError where the machine has none."""
+    try:
+        import moderngl
+
+        return moderngl.create_standalone_context(backend="egl", require=330)
+    except Exception as error:  # moderngl raises bare Exceptions
+        raise UserError(f"OpenGL does not start here ({error}): {INSTALL}") from None
+
+
+def projection(camera: Camera, near: float, far: float) -> np.ndarray:
+    """(4, 4) from the camera's frame to clip space."""
+    x, y, z, w = lens(camera)
+    depth = (far + near) / (near - far), 2 * far * near / (near - far)
+    return np.array([[x, 0, -z, 0], [0, y, -w, 0], [0, 0, *depth], [0, 0, -1, 0]])
+
+
+def lens(camera: Camera) -> tuple[float, float, float, float]:
+    """Focal lengths and principal point in halves of the image, y up: ndc = lens[:2] * (x, y) / -z + lens[2:]."""
+    return (
+        2 * camera.fx / camera.width,
+        2 * camera.fy / camera.height,
+        2 * camera.cx / camera.width - 1,
+        1 - 2 * camera.cy / camera.height,
+    )
+
+
+class Drawing:
+    """A scene on the GPU. Use as a context manager, or ``close`` it.
+
+    texture_format: "fp16" holds features as half floats, "rgba8" as bytes with a range per channel. ``near`` and ``far``: of the
+    depth buffer, world units.
+    """
+
+    def __init__(self, baked: Baked, atlas: AtlasMesh, near: float, far: float, texture_format: TextureFormat = "fp16"):
+        self._gl = context()
+        self._near, self._far = near, far
+        self._centre = np.asarray(baked.sky_centre, float)
+        self._skyboxes = baked.sky_size[0]
+        mesh, sky = baked.mesh_texture(), baked.sky_textures()
+        largest = self._gl.info["GL_MAX_TEXTURE_SIZE"]
+        if max(mesh.shape[:2]) > largest:
+            raise UserError(f"the texture is {mesh.shape[1]} x {mesh.shape[0]}, OpenGL here takes {largest}: lower atlas.size")
+        exact = texture_format == "fp16"
+        mesh_ranges, sky_ranges = (None, None) if exact else (Ranges.of(mesh), Ranges.of(sky))
+        self._mesh = self._gl.program(*mesh_shaders(baked, "desktop", mesh_ranges))
+        self._sky = self._gl.program(*sky_shaders(baked, "desktop", sky_ranges))
+        self._textures = [
+            *self._upload(self._mesh, "mesh", mesh[None], mesh_ranges, array=False),
+            *self._upload(self._sky, "sky", sky.reshape(-1, *sky.shape[2:]), sky_ranges, array=True),
+        ]
+        if "codes" in self._mesh:
+            codes = baked.mesh_indices if baked.quantized else np.zeros((1, 1), np.uint16)
+            texture = self._gl.texture(codes.shape[::-1], 1, np.ascontiguousarray(codes).tobytes(), alignment=1, dtype="u2")
+            texture.filter = (self._gl.NEAREST, self._gl.NEAREST)
+            self._textures.append((self._mesh, "codes", texture))
+        chart = np.zeros(len(atlas.vertices), np.float32)
+        chart[atlas.faces] = atlas.charts[:, None]
+        vertices = np.concatenate([atlas.vertices - self._centre, atlas.uvs, chart[:, None]], axis=1).astype(np.float32)
+        parts = (self._gl.buffer(vertices.tobytes()), "3f 2f 1f", "position", "uv", "chart")
+        kept = [name for name in parts[2:] if name in self._mesh]
+        layout = " ".join(
+            code if name in kept else f"{int(code[0]) * 4}x" for code, name in zip(parts[1].split(), parts[2:], strict=True)
+        )
+        indices = self._gl.buffer(np.ascontiguousarray(atlas.faces, np.int32).tobytes())
+        self._triangles = self._gl.vertex_array(self._mesh, [(parts[0], layout, *kept)], indices)
+        self._screen = self._gl.vertex_array(self._sky, [])
+        self._target: Any = None
+
+    def _upload(self, program: Any, name: str, maps: np.ndarray, ranges: Ranges | None, array: bool) -> list[tuple[Any, str, Any]]:
+        """Textures of (N, H, W, D) features, four channels each."""
+        count, height, width, channels = maps.shape
+        made = []
+        for index in range(textures(channels)):
+            if ranges is None:
+                part = np.zeros((count, height, width, 4), np.float16)
+                values = maps[..., 4 * index : 4 * index + 4]
+                part[..., : values.shape[-1]] = values
+            else:
+                part = ranges.quantized(maps)[..., 4 * index : 4 * index + 4]
+            data, kind = np.ascontiguousarray(part).tobytes(), "f2" if ranges is None else "f1"
+            texture = (
+                self._gl.texture_array((width, height, count), 4, data, alignment=1, dtype=kind)
+                if array
+                else self._gl.texture((width, height), 4, data, alignment=1, dtype=kind)
+            )
+            texture.filter = (self._gl.LINEAR, self._gl.LINEAR)
+            texture.repeat_x = texture.repeat_y = False
+            made.append((program, f"{name}{index}", texture))
+        return made
+
+    def render(self, camera: Camera, mode: str = "full", skybox: int = -1) -> np.ndarray:
+        """(H, W, 3) float32 in [0, 1]. ``mode``: one of ``shaders.MODES``; ``skybox``: show this one alone."""
+        self.draw(camera, mode, skybox)
+        with self._gl:
+            data = np.frombuffer(self._target.read(components=4, dtype="f4"), np.float32)
+        return data.reshape(camera.height, camera.width, 4)[::-1, :, :3].copy()
+
+    def draw(self, camera: Camera, mode: str = "full", skybox: int = -1) -> None:
+        """Draw without reading the picture back; ``finish`` waits for it."""
+        with self._gl:  # another scene's context may be current
+            self._draw(camera, mode, skybox)
+
+    def _draw(self, camera: Camera, mode: str, skybox: int) -> None:
+        size = (camera.width, camera.height)
+        if self._target is None or self._target.size != size:
+            colour = self._gl.texture(size, 4, dtype="f4")
+            self._target = self._gl.framebuffer([colour], self._gl.depth_texture(size))
+        pose = camera.camera_to_world
+        eye = pose[:3, 3] - self._centre
+        view = np.eye(4)
+        view[:3, :3], view[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ eye
+        matrix = projection(camera, self._near, self._far) @ view
+        for program, values in (
+            (self._mesh, {"clip_from_scene": matrix.T, "eye": eye, "mode": MODES.index(mode)}),
+            (self._sky, {"world_from_camera": pose[:3, :3].T, "lens": lens(camera), "eye": eye, "mode": MODES.index(mode)}),
+        ):
+            for name, value in values.items():
+                if name in program:
+                    program[name] = tuple(np.ravel(value).tolist()) if np.ndim(value) else value
+        if "only" in self._sky:
+            self._sky["only"] = skybox
+        for unit, (program, name, texture) in enumerate(self._textures):
+            if name in program:
+                texture.use(unit)
+                program[name] = unit
+        self._target.use()
+        self._target.clear(0.0, 0.0, 0.0, 1.0, depth=1.0)
+        self._gl.enable(self._gl.DEPTH_TEST)
+        self._gl.depth_func = "<="
+        self._triangles.render()
+        self._screen.render(vertices=3)
+
+    def finish(self) -> None:
+        """Wait until all is drawn."""
+        with self._gl:
+            self._gl.finish()
+
+    def close(self) -> None:
+        self._gl.release()
+
+    def __enter__(self) -> Drawing:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

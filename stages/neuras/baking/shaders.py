@@ -1,0 +1,231 @@
+"""The fragment shaders of a fitted scene, its two networks written out as constants.
+
+One text serves two dialects: GLSL 3.30 for engines and GLSL ES 3.00 for WebGL 2. Features lie four to a texture in RGBA; a
+network's layer is a sum of 4 x 4 matrices times four features each. ``model.neuras.baked.Baked.render`` says what is computed.
+Coordinates are relative to the skyboxes' centre: single precision is too coarse for map coordinates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.neuras.baked import Baked, Layer
+
+DIALECTS = {
+    "desktop": "#version 330\n",
+    "web": "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2DArray;\n"
+    "precision highp usampler2D;\n",
+}  # fmt: skip
+MODES = ("full", "mesh", "skyboxes", "opacity", "charts", "codes")  # what a shader can show: uniform int mode
+
+MESH_VERTEX = """
+in vec3 position;   // relative to the skyboxes' centre
+in vec2 uv;         // v runs down, so row 0 of the texture is v = 0
+in float chart;
+uniform mat4 clip_from_scene;
+uniform vec3 eye;
+out vec2 place;
+out vec3 ray;
+flat out float chart_number;
+void main() {
+    gl_Position = clip_from_scene * vec4(position, 1.0);
+    place = uv;
+    ray = position - eye;
+    chart_number = chart;
+}
+"""
+
+SKY_VERTEX = """
+uniform mat3 world_from_camera;
+uniform vec4 lens;  // focal lengths and principal point in halves of the image: ndc = lens.xy * (x, y) / -z + lens.zw
+out vec3 ray;
+void main() {       // one triangle over the whole image, at the far plane
+    vec2 ndc = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
+    ray = world_from_camera * vec3((ndc - lens.zw) / lens.xy, -1.0);
+    gl_Position = vec4(ndc, 1.0, 1.0);
+}
+"""
+
+COLOURS = """
+vec3 number_colour(float number) {  // neighbours in number differ in colour
+    vec3 turn = fract(number * vec3(0.61803399, 0.75487767, 0.56984029) + vec3(0.1, 0.4, 0.7));
+    return 0.25 + 0.75 * turn;
+}
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Ranges:
+    """How 8-bit texels become features: feature = low + span * texel, per channel. (4 n,) float32 each."""
+
+    low: np.ndarray
+    span: np.ndarray
+
+    @classmethod
+    def of(cls, features: np.ndarray) -> Ranges:
+        """Of (.., D) features; channels beyond D, which fill the last texture, are 0."""
+        flat = features.reshape(-1, features.shape[-1])
+        low = _padded(flat.min(axis=0).astype(np.float32))
+        return cls(low, _padded(flat.max(axis=0).astype(np.float32)) - low)
+
+    def quantized(self, features: np.ndarray) -> np.ndarray:
+        """(.., 4 n) uint8 of (.., D) features."""
+        channels = features.shape[-1]
+        span = np.where(self.span > 0, self.span, 1)[:channels]
+        values = np.clip((features - self.low[:channels]) / span, 0, 1)
+        return _padded(np.rint(values * 255).astype(np.uint8))
+
+
+def _padded(values: np.ndarray) -> np.ndarray:
+    """With zeros after the last axis, to a multiple of four."""
+    missing = -values.shape[-1] % 4
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])
+
+
+def textures(channels: int) -> int:
+    """RGBA textures that so many channels need."""
+    return -(-channels // 4)
+
+
+def mesh_shaders(baked: Baked, dialect: str, ranges: Ranges | None) -> tuple[str, str]:
+    """Vertex and fragment shader of the mesh. ``ranges``: None where textures hold features themselves (half floats)."""
+    count = textures(baked.channels)
+    samplers = "".join(f"uniform sampler2D mesh{i};\n" for i in range(count))
+    features = "".join(f"    vec4 f{i} = {_texel(f'texture(mesh{i}, place)', ranges, i)};\n" for i in range(count))
+    body = f"""
+in vec2 place;
+in vec3 ray;
+flat in float chart_number;
+out vec4 colour;
+uniform int mode;
+uniform usampler2D codes;
+{samplers}{COLOURS}
+{_network("mesh_colour", baked.mesh_mlp, count, baked.channels, baked.view_dependent)}
+void main() {{
+    if (mode == 2) discard;
+    if (mode == 3) {{ colour = vec4(1.0); return; }}
+    if (mode == 4) {{ colour = vec4(number_colour(chart_number), 1.0); return; }}
+    if (mode == 5) {{
+        colour = vec4(number_colour(float(texelFetch(codes, ivec2(place * vec2(textureSize(codes, 0))), 0).r)), 1.0);
+        return;
+    }}
+{features}    colour = vec4(clamp(mesh_colour({_features(count)}, normalize(ray)), 0.0, 1.0), 1.0);
+}}
+"""
+    return DIALECTS[dialect] + MESH_VERTEX, DIALECTS[dialect] + body
+
+
+def sky_shaders(baked: Baked, dialect: str, ranges: Ranges | None) -> tuple[str, str]:
+    """Vertex and fragment shader of the skyboxes, composited near to far in one pass (eq. 4)."""
+    count, (layers, _) = textures(baked.channels), baked.sky_size
+    samplers = "".join(f"uniform sampler2DArray sky{i};\n" for i in range(count))
+    features = "".join(
+        f"        vec4 f{i} = {_texel(f'texture(sky{i}, vec3(st, float(6 * layer + face)))', ranges, i)};\n" for i in range(count)
+    )
+    halves = ", ".join(f"vec3({_list(half)})" for half in baked.sky_half_sizes)
+    hidden_count = -(-len(baked.sky_mlp[0][1]) // 4) if baked.sky_mlp else count
+    hidden = _layer("h", [f"f{i}" for i in range(count)], [baked.channels], *baked.sky_mlp[0], True) if baked.sky_mlp else ""
+    seen = [f"h{i}" for i in range(hidden_count)] if baked.sky_mlp else [f"f{i}" for i in range(count)]
+    width = len(baked.sky_mlp[0][1]) if baked.sky_mlp else baked.channels
+    body = f"""
+in vec3 ray;
+out vec4 colour;
+uniform int mode;
+uniform int only;  // show this skybox alone; -1: all
+uniform vec3 eye;
+{samplers}
+const vec3 half_sizes[{layers}] = vec3[{layers}]({halves});
+{_network("sky_colour", baked.sky_mlp[1:], len(seen), width, baked.view_dependent)}
+void leave(vec3 start, vec3 way, vec3 size, out int face, out vec2 st) {{  // where a ray from inside leaves the cuboid
+    vec3 side = vec3(way.x < 0.0 ? -1.0 : 1.0, way.y < 0.0 ? -1.0 : 1.0, way.z < 0.0 ? -1.0 : 1.0);
+    vec3 safe = mix(way, side * 1e-12, lessThan(abs(way), vec3(1e-12)));
+    vec3 steps = (side * size - start) / safe;
+    float nearest = min(steps.x, min(steps.y, steps.z));
+    vec3 point = (start + nearest * way) / size;
+    int axis = steps.x == nearest ? 0 : (steps.y == nearest ? 1 : 2);
+    st = ((axis == 0 ? point.yz : (axis == 1 ? point.xz : point.xy)) + 1.0) / 2.0;
+    face = 2 * axis + ((axis == 0 ? way.x : (axis == 1 ? way.y : way.z)) < 0.0 ? 1 : 0);
+}}
+void main() {{
+    if (mode == 1 || mode == 4 || mode == 5) {{ colour = vec4(0.0, 0.0, 0.0, 1.0); return; }}
+    vec3 way = normalize(ray);
+    vec3 light = vec3(0.0);
+    float passed = 1.0;
+    for (int layer = 0; layer < {layers}; layer++) {{
+        if (only >= 0 && layer != only) continue;
+        int face;
+        vec2 st;
+        leave(eye, way, half_sizes[layer], face, st);
+{features}{hidden}        float opacity = 1.0 / (1.0 + exp(-({_dot(baked.sky_opacity, seen)})));
+        light += passed * opacity * sky_colour({", ".join(seen)}, way);
+        passed *= 1.0 - opacity;
+        if (passed < 0.0005) break;  // an eighth of an 8-bit step
+    }}
+    colour = vec4(mode == 3 ? vec3(1.0 - passed) : clamp(light, 0.0, 1.0), 1.0);
+}}
+"""
+    return DIALECTS[dialect] + SKY_VERTEX, DIALECTS[dialect] + body
+
+
+def _texel(sample: str, ranges: Ranges | None, index: int) -> str:
+    if ranges is None:
+        return sample
+    part = slice(4 * index, 4 * index + 4)
+    return f"vec4({_list(ranges.low[part])}) + vec4({_list(ranges.span[part])}) * {sample}"
+
+
+def _features(count: int) -> str:
+    return ", ".join(f"f{i}" for i in range(count))
+
+
+def _network(name: str, layers: list[Layer], count: int, channels: int, view_dependent: bool) -> str:
+    """A function from ``count`` vec4 of features (``channels`` numbers) and the view direction to a colour."""
+    arguments = ", ".join(f"vec4 f{i}" for i in range(count))
+    text = f"vec3 {name}({arguments}, vec3 way) {{\n"
+    names, blocks = [f"f{i}" for i in range(count)], [channels]
+    if view_dependent and layers:
+        names, blocks = [*names, "vec4(way, 0.0)"], [channels, 3]
+    for number, (weight, bias) in enumerate(layers):
+        last = number == len(layers) - 1
+        text += _layer(f"x{number}_", names, blocks, weight, bias, not last)
+        names, blocks = [f"x{number}_{i}" for i in range(-(-len(bias) // 4))], [len(bias)]
+    return f"{text}    return {names[0]}.rgb;\n}}\n"
+
+
+def _layer(name: str, inputs: list[str], blocks: list[int], weight: np.ndarray, bias: np.ndarray, relu: bool) -> str:
+    """Statements ``vec4 name0 = ..`` for each four outputs. ``blocks``: how many columns of ``weight`` (out, in) belong to the
+    inputs that are filled up to a multiple of four each."""
+    columns, start = [], 0
+    for width in blocks:
+        columns.append(_padded(weight[:, start : start + width]))
+        start += width
+    assert start == weight.shape[1], "the network's inputs are not those of the shader"
+    matrix = np.concatenate(columns, axis=1)
+    rows = -len(bias) % 4
+    matrix, bias = np.pad(matrix, ((0, rows), (0, 0))), np.pad(bias, (0, rows))
+    text = ""
+    for out in range(len(bias) // 4):
+        part = slice(4 * out, 4 * out + 4)
+        terms = [f"mat4({_list(matrix[part, 4 * i : 4 * i + 4].T.ravel())}) * {value}" for i, value in enumerate(inputs)]
+        total = "\n        + ".join([f"vec4({_list(bias[part])})", *terms])
+        text += f"    vec4 {name}{out} = {f'max({total}, 0.0)' if relu else total};\n"
+    return text
+
+
+def _dot(layer: Layer, inputs: list[str]) -> str:
+    """The one output of a layer."""
+    weight, bias = _padded(layer[0][0]), float(layer[1][0])
+    terms = [f"dot(vec4({_list(weight[4 * i : 4 * i + 4])}), {value})" for i, value in enumerate(inputs)]
+    return " + ".join([_number(bias), *terms])
+
+
+def _list(values: np.ndarray) -> str:
+    return ", ".join(_number(value) for value in np.asarray(values).ravel())
+
+
+def _number(value: float) -> str:
+    """A literal that reads back as the same single-precision number."""
+    text = f"{np.float32(value):.9g}"
+    return text if any(mark in text for mark in ".e") else f"{text}.0"

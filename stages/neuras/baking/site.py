@@ -1,0 +1,183 @@
+"""The folder of a baked scene: a complete web site, and all that another engine needs.
+
+=================  ====================================================================================
+index.html, *.js   the page; no build step, no network
+scene.json         sizes, formats, skyboxes, cameras of the frames, shaders' names
+geometry.glb       the mesh: POSITION relative to the skyboxes' centre, TEXCOORD_0 (v down), _CHART
+mesh_codes.png     code of each texel: low byte in R, high byte in G (quantized scenes)
+sky_codes.png      the same of the skyboxes: a row of six faces for each, the nearest on top
+codebooks.bin      float32: mesh codes (K, D), then sky codes (K, D)
+mesh_I.png, ...    features of scenes without quantization: bytes in RGBA, four channels each (``ranges`` in scene.json)
+shaders/           GLSL ES 3.00 for WebGL 2 and GLSL 3.30 for engines
+frames/            original photos, to compare with
+=================  ====================================================================================
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from model.neuras.baked import Baked
+from stages.neuras.baking.drawing import lens
+from stages.neuras.baking.shaders import MODES, Ranges, mesh_shaders, sky_shaders, textures
+from stages.neuras.records import FRAME, AtlasMesh, CaptureInfo, FrameRecord
+
+PAGE = Path(__file__).parent / "page"
+
+
+def write_site(
+    folder: Path,
+    baked: Baked,
+    atlas: AtlasMesh,
+    info: CaptureInfo,
+    frames: Iterable[FrameRecord],
+    depth_range: tuple[float, float],
+    expand: str,
+) -> dict[str, int]:
+    """Write the site; returns the bytes of its kinds of files: "geometry", "textures", "shaders", "page".
+
+    frames: those whose photos and cameras the page offers. depth_range: near and far plane, world units. expand: what the
+    page's loader makes of codes, "rgba8" or "fp16".
+    """
+    (folder / "shaders").mkdir(parents=True, exist_ok=True)
+    (folder / "frames").mkdir(exist_ok=True)
+    mesh, sky = baked.mesh_texture(), baked.sky_textures()
+    bytes_wanted = expand == "rgba8" or not baked.quantized  # the page has no half-float files
+    ranges = {"mesh": Ranges.of(mesh), "sky": Ranges.of(sky)} if bytes_wanted else {"mesh": None, "sky": None}
+    _geometry(folder / "geometry.glb", atlas, baked.sky_centre)
+    if baked.quantized:
+        _codes(folder / "mesh_codes.png", baked.mesh_indices)
+        _codes(folder / "sky_codes.png", _in_rows(baked.sky_indices))
+        books = [np.ascontiguousarray(book, np.float32) for book in (baked.mesh_codebook, baked.sky_codebook)]
+        (folder / "codebooks.bin").write_bytes(b"".join(book.tobytes() for book in books))
+    else:
+        for name, maps in (("mesh", mesh), ("sky", _in_rows(sky))):
+            values = ranges[name].quantized(maps)
+            for index in range(textures(baked.channels)):
+                part = np.ascontiguousarray(values[..., 4 * index : 4 * index + 4])
+                Image.fromarray(part, "RGBA").save(folder / f"{name}_{index}.png")
+    for dialect in ("web", "desktop"):
+        for name, make in (("mesh", mesh_shaders), ("sky", sky_shaders)):
+            for kind, text in zip(("vert", "frag"), make(baked, dialect, ranges[name]), strict=True):
+                (folder / "shaders" / f"{name}.{dialect}.{kind}").write_text(text)
+    views = [_view(folder, frame, baked.sky_centre) for frame in frames]
+    layers, side = baked.sky_size
+    scene = {
+        "format": 1,
+        "channels": baked.channels,
+        "textures": textures(baked.channels),
+        "quantized": baked.quantized,
+        "expand": "rgba8" if bytes_wanted else "fp16",
+        "ranges": {
+            name: None if r is None else {"low": r.low.tolist(), "span": r.span.tolist()} for name, r in ranges.items()
+        },
+        "mesh": {"width": atlas.width, "height": atlas.height, "faces": len(atlas.faces)},
+        "skyboxes": {"count": layers, "side": side, "half_sizes": baked.sky_half_sizes.tolist()},
+        "codes": {name: len(book) for name, book in (("mesh", baked.mesh_codebook), ("sky", baked.sky_codebook))}
+        if baked.quantized
+        else None,
+        "modes": list(MODES),
+        "centre": [float(x) for x in baked.sky_centre],
+        "up": list(info.up),
+        "metre": info.metre,
+        "units": info.units,
+        "near": depth_range[0],
+        "far": depth_range[1],
+        "frames": views,
+    }
+    (folder / "scene.json").write_text(json.dumps(scene, indent=1, allow_nan=False) + "\n")
+    for path in sorted(PAGE.iterdir()):
+        if path.suffix in (".html", ".js", ".css"):
+            shutil.copyfile(path, folder / path.name)
+    return _sizes(folder)
+
+
+def _in_rows(maps: np.ndarray) -> np.ndarray:
+    """(L S, 6 S, ..): the faces (L, 6, S, S, ..) as one picture, a row for each skybox."""
+    layers, faces, side = maps.shape[:3]
+    return np.moveaxis(maps, 1, 2).reshape(layers * side, faces * side, *maps.shape[4:])
+
+
+def _geometry(path: Path, atlas: AtlasMesh, centre: np.ndarray) -> None:
+    """A binary glTF. Indices and attributes lie in one buffer, in the order of its accessors."""
+    chart = np.zeros(len(atlas.vertices), np.float32)
+    chart[atlas.faces] = atlas.charts[:, None]
+    positions = (atlas.vertices - np.asarray(centre)).astype(np.float32)
+    arrays = [
+        (np.ascontiguousarray(atlas.faces, np.uint32).ravel(), 5125, "SCALAR", 34963),
+        (positions, 5126, "VEC3", 34962),
+        (np.ascontiguousarray(atlas.uvs, np.float32), 5126, "VEC2", 34962),
+        (chart, 5126, "SCALAR", 34962),
+    ]
+    accessors: list[dict[str, Any]] = []
+    views, data = [], b""
+    for index, (array, kind, shape, target) in enumerate(arrays):
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": target})
+        accessors.append({"bufferView": index, "componentType": kind, "count": len(array), "type": shape})
+        data += array.tobytes()  # all are multiples of four bytes
+    accessors[1] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    attributes = {"POSITION": 1, "TEXCOORD_0": 2, "_CHART": 3}
+    document = {
+        "asset": {"version": "2.0", "generator": "lightmill"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0}]}],
+        "buffers": [{"byteLength": len(data)}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    header = b"glTF" + np.array([2, 28 + len(text) + len(data), len(text)], "<u4").tobytes() + b"JSON"
+    path.write_bytes(header + text + np.array([len(data)], "<u4").tobytes() + b"BIN\0" + data)
+
+
+def _codes(path: Path, codes: np.ndarray) -> None:
+    pixels = np.stack([codes & 255, codes >> 8, np.zeros_like(codes)], axis=-1).astype(np.uint8)
+    Image.fromarray(pixels, "RGB").save(path, optimize=True)
+
+
+def _view(folder: Path, frame: FrameRecord, centre: np.ndarray) -> dict[str, Any]:
+    """A frame as the page knows it; its photo is written beside. World coordinates are relative to the centre."""
+    name = frame.id.removeprefix(FRAME)
+    path = folder / "frames" / f"{name}.jpg"
+    if frame.picture.startswith(b"\xff\xd8"):
+        path.write_bytes(frame.picture)
+    else:
+        buffer = io.BytesIO()
+        Image.fromarray(frame.image()).save(buffer, "JPEG", quality=92)
+        path.write_bytes(buffer.getvalue())
+    pose = frame.camera.camera_to_world.copy()
+    pose[:3, 3] -= centre
+    return {
+        "name": name,
+        "split": frame.split,
+        "trajectory": frame.trajectory,
+        "image": f"frames/{path.name}",
+        "width": frame.camera.width,
+        "height": frame.camera.height,
+        "lens": list(lens(frame.camera)),
+        "camera_to_world": pose.tolist(),
+    }
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    kinds = {"geometry": 0, "textures": 0, "shaders": 0, "frames": 0, "page": 0}
+    for path in folder.rglob("*"):
+        if path.is_file():
+            kind = path.parent.name if path.parent != folder else "page"
+            if path.suffix == ".glb":
+                kind = "geometry"
+            elif kind == "page" and path.suffix in (".png", ".bin"):
+                kind = "textures"
+            kinds[kind] += path.stat().st_size
+    return kinds

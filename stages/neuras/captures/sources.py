@@ -1,0 +1,277 @@
+"""What a source of a capture is, and the source that all sets on disk share.
+
+A reader (``nerfstudio``, ``colmap``, ``pandaset``) turns a folder's files into an ``Inventory``: facts, no pixels. A
+``FolderSource`` makes records of it. What is wrong with one frame is that frame's fault, told when the frame is asked for;
+what is wrong with the whole set is a UserError at once.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.config import StageConfig, count, existing_folder, report, runtime
+from pipeline.errors import Reject, UserError
+from pipeline.keys import digest_of
+from stages.graphics.geometry.paths import check_path
+from stages.neuras.captures import pictures, poses, splits
+from stages.neuras.captures.lenses import Lens
+from stages.neuras.records import FRAME, POINTS, CaptureInfo, FrameRecord, Mesh, PointsRecord, Split
+
+SEEN = 50_000  # points that decide the capture's ball
+AXES = {sign + name: tuple((-1.0 if sign else 1.0) * (name == axis) for axis in "xyz") for name in "xyz" for sign in ("", "-")}
+
+
+class Source(Protocol):
+    """A capture: its items, and what each becomes. An item's id is its record's id, ``frame-..`` or ``points-..``.
+
+    ``items``, ``mesh`` and ``info`` are asked for outside the workers too: they may need nothing that is prepared.
+    """
+
+    def items(self) -> list[tuple[str, str]]:
+        """(id, group) of all items; the group is the frame's split, or "points"."""
+
+    def frame(self, id: str) -> FrameRecord:
+        """The frame; raises Reject."""
+
+    def points(self, id: str) -> PointsRecord:
+        """The points; raises Reject."""
+
+    def mesh(self) -> Mesh | None:
+        """The given mesh, if there is one."""
+
+    def info(self) -> CaptureInfo:
+        """What holds for the whole capture."""
+
+
+class FolderConfig(StageConfig):
+    """What the captures in folders have in common."""
+
+    path: str | None = runtime(None)  # capture.path=DIR; the content of its files is what counts
+    mesh: str | None = runtime(None)  # a mesh to learn on; null: mesh.ply, mesh.glb or mesh.obj in the folder, if there is one
+    every: int = count(1, ge=1)  # keep every so-many-th frame, of each split by itself where the set names them
+    split: splits.Rule = "auto"  # auto: the names that the set gives, else every_other
+    seed: int = 0  # of random_half
+    max_side: int | None = Field(None, ge=16)  # longest side of a picture in pixels, larger ones are made smaller
+    units: Literal["auto", "metre", "arbitrary"] = report("auto")  # auto: what the set says, else arbitrary
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = report("auto")  # auto: what the set says, else from the cameras
+    max_pixels: int = Field(100_000_000, ge=1)  # of a picture
+    max_bytes: int = Field(4 << 30, ge=1)  # of the mesh or a file of points
+    max_faces: int = Field(20_000_000, ge=1)  # of the mesh
+
+
+@dataclass
+class Shot:
+    """A posed image as a set on disk states it. moment: what frames taken at one time share. split: as the set names it."""
+
+    name: str  # of the image, relative to the capture's folder, for people
+    moment: Hashable = None
+    image: Path | None = None
+    mask: Path | None = None
+    lens: Lens | None = None
+    camera_to_world: np.ndarray | None = None
+    split: Split | None = None
+    time: float | None = None
+    meta: dict[str, Any] = field(default_factory=dict)
+    fault: Reject | None = None  # why it cannot be used
+
+
+@dataclass
+class PointSet:
+    """Points in a file, read when they are asked for. read: (P, 3) float32 and the sensor's position (3,) or None.
+
+    moment: of the frames that were taken with it; None for what belongs to no one time.
+    """
+
+    name: str
+    file: Path
+    read: Callable[[], tuple[np.ndarray, np.ndarray | None]]
+    moment: Hashable = None
+
+
+@dataclass
+class Inventory:
+    """What a reader finds. units and up: None where the set does not say. units_from: where it says so, in words."""
+
+    shots: list[Shot]
+    sets: list[PointSet] = field(default_factory=list)
+    points: Literal["lidar", "sfm", "none"] = "none"
+    units: Literal["metre", "arbitrary"] | None = None
+    units_from: str = "nothing in the set says it"
+    up: tuple[float, float, float] | None = None
+
+
+def shot_of(name: str, fill: Callable[[Shot], None]) -> Shot:
+    """A shot that ``fill`` completes; a Reject that it raises becomes the shot's fault."""
+    shot = Shot(name)
+    try:
+        fill(shot)
+    except Reject as error:
+        shot.fault = error
+    return shot
+
+
+def file_in(root: Path, name: Any, what: str) -> Path:
+    """The file inside ``root`` that a set names, or a Reject."""
+    if not isinstance(name, str) or not name:
+        raise Reject(f"no_{what}", f"no {what} is named")
+    path = check_path(name, root, root)
+    if not path.is_file():
+        raise Reject(f"no_{what}", f"there is no file {name!r}")
+    return path
+
+
+class FolderSource:
+    """The capture in a folder, by a reader of its kind."""
+
+    def __init__(self, config: FolderConfig, read: Callable[[FolderConfig, Path], Inventory]):
+        self.config = config
+        self.root = existing_folder("capture.path", config.path, f"capture={config.name} needs a folder")
+        self.inventory = read(config, self.root)
+        shots = self.inventory.shots
+        kept = splits.kept([shot.split for shot in shots], config.every)
+        self.shots = dict(zip(_ids([shots[index].name for index in kept]), (shots[index] for index in kept), strict=True))
+        chosen = list(self.shots.values())
+        assigned, self.split_rule = splits.assigned(
+            [shot.moment for shot in chosen], [shot.split for shot in chosen], config.split, config.seed
+        )
+        self.splits = dict(zip(self.shots, assigned, strict=True))
+        if config.every > 1:
+            self.split_rule += f"; of the set's frames one in {config.every} is taken"
+        held = {shot.moment for shot, split in zip(chosen, assigned, strict=True) if split == "test"}
+        self.sets = {f"{POINTS}{it.name}": it for it in self.inventory.sets if it.moment is None or it.moment not in held}
+        self.mesh_file = _mesh_file(config, self.root)
+        self._check()
+
+    def items(self) -> list[tuple[str, str]]:
+        return [*self.splits.items(), *((id, "points") for id in self.sets)]
+
+    def frame(self, id: str) -> FrameRecord:
+        shot = self.shots[id]
+        if shot.fault is not None:
+            raise shot.fault
+        picture = pictures.made(shot.image, shot.mask, shot.lens, self.config.max_side, self.config.max_pixels)
+        camera = shot.lens.camera(shot.camera_to_world).resized(*picture.size)
+        return FrameRecord(
+            id, camera, picture.image, self.splits[id], time=shot.time, mask=picture.mask, meta={"file": shot.name, **shot.meta}
+        )
+
+    def points(self, id: str) -> PointsRecord:
+        points, sensor = self.sets[id].read()
+        finite = np.isfinite(points).all(axis=1)
+        if not finite.any():
+            raise Reject("no_points", f"{self.sets[id].file.name} holds no point")
+        return PointsRecord(id, points[finite].astype(np.float32), sensor)
+
+    def mesh(self) -> Mesh | None:
+        """The given mesh; UserError where it is none."""
+        from stages.graphics.geometry.load import load_mesh
+
+        if self.mesh_file is None:
+            return None
+        try:
+            loaded = load_mesh(self.mesh_file, self.mesh_file.parent, self.config.max_bytes, self.config.max_faces)
+        except Reject as error:
+            raise UserError(f"the mesh {str(self.mesh_file)!r} cannot be used: {error.detail}") from None
+        return Mesh(loaded.vertices.astype(np.float32), loaded.faces.astype(np.int32))
+
+    def info(self) -> CaptureInfo:
+        config, inventory = self.config, self.inventory
+        usable = [(self.splits[id], shot) for id, shot in self.shots.items() if shot.fault is None]
+        cameras = [shot.lens.camera(shot.camera_to_world) for split, shot in usable if split == "train"]
+        up = AXES[config.up] if config.up != "auto" else inventory.up
+        up_from = "capture.up" if config.up != "auto" else "the set" if up is not None else "the cameras, held without roll"
+        centre, radius = poses.ball(cameras, self._surface())
+        units = config.units if config.units != "auto" else inventory.units or "arbitrary"
+        return CaptureInfo(
+            units=units,
+            metre=1.0 if units == "metre" else radius / 100,
+            up=tuple(float(x) for x in (up if up is not None else poses.upward(cameras))),
+            centre=tuple(float(x) for x in centre),
+            radius=radius,
+            points=inventory.points if self.sets else "none",
+            split_rule=self.split_rule,
+            source={
+                "kind": config.name,
+                "units_from": "capture.units" if config.units != "auto" else inventory.units_from,
+                "up_from": up_from,
+            },
+        )
+
+    def hashes(self, hash_file: Callable[[Any], str]) -> dict[str, Any]:
+        """What decides the output: per item its files' content and its facts; the mesh's content for the whole."""
+        items: dict[str, Any] = {}
+        for id, shot in self.shots.items():
+            facts = {
+                "files": [hash_file(path) for path in (shot.image, shot.mask) if path is not None],
+                "lens": shot.lens and {name: _plain(value) for name, value in vars(shot.lens).items()},
+                "pose": None if shot.camera_to_world is None else shot.camera_to_world.tolist(),
+                "said": [self.splits[id], shot.time, shot.name, shot.meta],
+                "fault": shot.fault and [shot.fault.reason, shot.fault.detail],
+            }
+            items[id] = digest_of(facts)
+        for id, it in self.sets.items():
+            items[id] = hash_file(it.file)
+        mesh = None if self.mesh_file is None else hash_file(self.mesh_file)
+        told = {"units": self.inventory.units, "up": _plain(self.inventory.up), "points": self.inventory.points}
+        return {"items": items, "mesh": mesh, "told": told}
+
+    def _surface(self) -> np.ndarray:
+        """(P, 3): points of the set, else of its mesh; some of them where there are many. Without either (0, 3)."""
+        found = []
+        for it in self.sets.values():
+            try:
+                found.append(self.points(f"{POINTS}{it.name}").points)
+            except Reject:
+                continue
+        mesh = None if found else self.mesh()
+        points = np.concatenate(found) if found else np.zeros((0, 3)) if mesh is None else mesh.vertices
+        return points[:: max(len(points) // SEEN, 1)].astype(np.float64)
+
+    def _check(self) -> None:
+        if not self.shots:
+            raise UserError(f"capture.path={str(self.root)!r} holds no frame")
+        if not any(shot.fault is None and self.splits[id] == "train" for id, shot in self.shots.items()):
+            faults = Counter(shot.fault.reason for shot in self.shots.values() if shot.fault is not None)
+            told = ", ".join(f"{number} {reason}" for reason, number in sorted(faults.items())) or "none is at fault"
+            first = next((f"; {shot.name}: {shot.fault.detail}" for shot in self.shots.values() if shot.fault is not None), "")
+            raise UserError(f"no training frame is usable ({len(self.shots)} frames: {told}{first})")
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _ids(names: Iterable[str]) -> list[str]:
+    """Record ids of the images' names: without what all paths begin with and without suffixes, in the same order."""
+    names = list(names)
+    twice = [name for name, number in Counter(names).items() if number > 1]
+    if twice:
+        raise UserError(f"the capture names {twice[0]!r} twice: a frame's image may appear once")
+    paths = [PurePosixPath(name.replace("\\", "/")) for name in names]
+    while paths and all(len(path.parts) > 1 for path in paths) and len({path.parts[0] for path in paths}) == 1:
+        paths = [PurePosixPath(*path.parts[1:]) for path in paths]
+    ids: dict[str, str] = {}
+    for name, path in zip(names, paths, strict=True):
+        slug = re.sub(r"[^A-Za-z0-9_]+", "-", str(path.with_suffix(""))).strip("-")[-100:] or "image"
+        if slug in ids:
+            raise UserError(f"the images {ids[slug]!r} and {name!r} differ in little more than signs: rename one of them")
+        ids[slug] = name
+    return [FRAME + slug for slug in ids]
+
+
+def _mesh_file(config: FolderConfig, root: Path) -> Path | None:
+    if config.mesh is not None:
+        path = Path(config.mesh).expanduser()
+        if not path.is_file():
+            raise UserError(f"capture.mesh={config.mesh!r} is not a file")
+        return path
+    beside = (root / f"mesh.{suffix}" for suffix in ("ply", "glb", "obj"))
+    return next((path for path in beside if path.is_file()), None)

@@ -1,0 +1,191 @@
+"""What NeuRas' stages exchange: the records of a capture, and the files of a scaffold and of an atlas.
+
+Frames: the world is the capture's, right-handed, in its own unit (``CaptureInfo.metre``). Cameras are
+``stages.graphics.cameras.Camera``. Images are 8-bit sRGB, row 0 on top. Texture coordinates have (0, 0) at the upper left
+corner, v runs down: texel [row, column] has its centre at ((column + 0.5) / W, (row + 0.5) / H).
+
+A capture's artifact holds *frame* records ("frame-..") and *points* records ("points-.."), and the files ``capture.json``
+(``CaptureInfo``) and, where a mesh is given, ``mesh.npz`` (``save_mesh``).
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from PIL import Image
+
+from pipeline.stage import Record
+from pipeline.store import Artifact
+from stages.graphics.arrays import pack_arrays, pack_json, unpack_arrays, unpack_json
+from stages.graphics.cameras import Camera
+
+FRAME, POINTS = "frame-", "points-"  # how the ids of a capture's records begin
+Split = Literal["train", "validation", "test", "shift"]  # shift: beside the driven path, only where truth exists
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRecord:
+    """A posed image.
+
+    picture: the bytes of a PNG or JPEG, of the camera's size. mask: the bytes of a PNG with one channel, 0 where a pixel is to be
+    ignored; None where all count. trajectory: its path, such as "drive" or "shift_2m_right"; ``shift``: metres to the right of
+    the drive. time: seconds, None where unknown. depth: (H, W) float32 true distance along the ray in world units, 0
+    for nothing, only where truth is known.
+    """
+
+    id: str
+    camera: Camera
+    picture: bytes
+    split: Split
+    trajectory: str = "drive"
+    shift: float = 0.0
+    time: float | None = None
+    mask: bytes | None = None
+    depth: np.ndarray | None = None
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    def image(self) -> np.ndarray:
+        """(H, W, 3) uint8, sRGB."""
+        return np.array(Image.open(io.BytesIO(self.picture)).convert("RGB"))
+
+    def counts(self) -> np.ndarray:
+        """(H, W) bool: pixels that the mask lets count."""
+        if self.mask is None:
+            return np.ones((self.camera.height, self.camera.width), bool)
+        return np.array(Image.open(io.BytesIO(self.mask)).convert("L")) > 0
+
+    def to_record(self) -> Record:
+        suffix = "png" if self.picture.startswith(b"\x89PNG") else "jpg"
+        names = ("split", "trajectory", "shift", "time", "meta")
+        members = {
+            f"image.{suffix}": self.picture,
+            "frame.json": pack_json({"camera": self.camera.to_json(), **{name: getattr(self, name) for name in names}}),
+        }
+        if self.mask is not None:
+            members["mask.png"] = self.mask
+        if self.depth is not None:
+            members["depth.npz"] = pack_arrays({"depth": self.depth.astype(np.float16)}, compressed=True)
+        return Record(self.id, members)
+
+    @classmethod
+    def from_record(cls, record: Record) -> FrameRecord:
+        values = unpack_json(record.members["frame.json"])
+        picture = record.members.get("image.png") or record.members["image.jpg"]
+        depth = record.members.get("depth.npz")
+        values["camera"] = Camera.from_json(values["camera"])
+        return cls(
+            record.id,
+            picture=picture,
+            mask=record.members.get("mask.png"),
+            depth=None if depth is None else unpack_arrays(depth)["depth"].astype(np.float32),
+            **values,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PointsRecord:
+    """Points on surfaces: a LiDAR sweep, or those of a structure-from-motion model.
+
+    points: (P, 3) float32, world. sensor: (3,) float32, where the sweep's beams came from; None where nothing measured them.
+    """
+
+    id: str
+    points: np.ndarray
+    sensor: np.ndarray | None = None
+
+    def to_record(self) -> Record:
+        arrays = {"points": self.points.astype(np.float32)}
+        if self.sensor is not None:
+            arrays["sensor"] = self.sensor.astype(np.float32)
+        return Record(self.id, {"points.npz": pack_arrays(arrays)})
+
+    @classmethod
+    def from_record(cls, record: Record) -> PointsRecord:
+        return cls(record.id, **unpack_arrays(record.members["points.npz"]))
+
+
+@dataclass(frozen=True)
+class CaptureInfo:
+    """What ``capture.json`` says of the whole capture.
+
+    metre: world units per metre, 1 where the capture is in metres; where its unit is unknown, a hundredth of ``radius``, and
+    ``units`` says "arbitrary". up: unit vector, world. centre: (3,) and radius: of a ball around the training cameras and
+    what they see, world units. points: "lidar", "sfm" or "none". sources: for people, where it came from and its licence.
+    """
+
+    units: Literal["metre", "arbitrary"]
+    metre: float
+    up: tuple[float, float, float]
+    centre: tuple[float, float, float]
+    radius: float
+    points: Literal["lidar", "sfm", "none"]
+    split_rule: str
+    source: dict[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def of(cls, capture: Artifact) -> CaptureInfo:
+        return cls(**unpack_json(capture.file("capture.json").read_bytes()))
+
+
+def frames(capture: Artifact, *splits: Split) -> Iterator[FrameRecord]:
+    """The frames of these splits (all, if none is named), in order of their ids."""
+    for row in sorted(capture.rows(), key=lambda row: row.id):  # a store has them by group
+        if row.id.startswith(FRAME):
+            frame = FrameRecord.from_record(capture.read(row.id))
+            if not splits or frame.split in splits:
+                yield frame
+
+
+def point_sets(capture: Artifact) -> Iterator[PointsRecord]:
+    """All points records, in order of their ids."""
+    for row in capture.rows():
+        if row.id.startswith(POINTS):
+            yield PointsRecord.from_record(capture.read(row.id))
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """vertices: (V, 3) float32, world. faces: (F, 3) int32."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class AtlasMesh:
+    """A mesh unfolded into a texture of ``width`` x ``height`` texels.
+
+    vertices: (N, 3) float32, world; a vertex on a seam stands here once per chart. uvs: (N, 2) float32 in [0, 1], v down.
+    faces: (F, 3) int32. charts: (F,) int32, the chart that a face belongs to.
+    """
+
+    vertices: np.ndarray
+    uvs: np.ndarray
+    faces: np.ndarray
+    charts: np.ndarray
+    width: int
+    height: int
+
+
+def save(path: Path, value: Mesh | AtlasMesh) -> None:
+    """Write ``mesh.npz`` or ``atlas.npz``, the same bytes every time."""
+    path.write_bytes(pack_arrays({name: np.asarray(array) for name, array in vars(value).items()}))
+
+
+def given_mesh(capture: Artifact) -> Mesh | None:
+    """The mesh that came with a capture, if one did."""
+    path = capture.path / "files" / "mesh.npz"
+    return Mesh(**unpack_arrays(path.read_bytes())) if path.exists() else None
+
+
+def load_atlas(path: Path) -> AtlasMesh:
+    arrays = unpack_arrays(path.read_bytes())
+    return AtlasMesh(**{**arrays, "width": arrays["width"].item(), "height": arrays["height"].item()})

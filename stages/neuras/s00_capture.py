@@ -1,0 +1,160 @@
+"""Stage capture: posed images, points and an optional mesh of one place, whatever they come as.
+
+Reads a folder, or makes up a street; writes frame and points records and ``files/capture.json``. The variants are sources
+of one shape (``stages.neuras.captures.sources.Source``), and the stage only dispatches. All end as OpenGL pinholes in a
+right-handed world in the capture's own unit: what follows knows no set by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from pipeline.config import StageConfig, runtime
+from pipeline.errors import UserError
+from pipeline.stage import Inputs, Item, MapStage, Record
+from stages.graphics.arrays import pack_json
+from stages.neuras.captures.sources import FolderConfig, FolderSource, Source
+from stages.neuras.records import POINTS, FrameRecord, frames, point_sets, save
+from stages.neuras.street.settings import StreetConfig
+
+if TYPE_CHECKING:
+    from pipeline.store import Draft
+
+
+class StreetCaptureConfig(StreetConfig, StageConfig):
+    """The embedded default: a street that is made up and path traced."""
+
+    name: Literal["street"] = "street"
+    backend: Literal["auto", "cuda", "llvm", "scalar"] = runtime("auto")  # of the path tracer; auto: the best that works here
+
+
+class NerfstudioConfig(FolderConfig):
+    """A folder with transforms.json."""
+
+    name: Literal["nerfstudio"] = "nerfstudio"
+
+
+class ColmapConfig(FolderConfig):
+    """A model of COLMAP, text or binary, and its images."""
+
+    name: Literal["colmap"] = "colmap"
+    model: str | None = None  # the model's folder below capture.path; null: sparse/0, sparse or the folder itself
+    images: str = "images"  # the images' folder below capture.path
+
+
+class PandasetConfig(FolderConfig):
+    """One sequence of PandaSet in its own layout."""
+
+    name: Literal["pandaset"] = "pandaset"
+    cameras: list[str] = Field(["front_camera"], min_length=1)  # folders below camera/
+
+
+class Capture(MapStage):
+    name: ClassVar[str] = "capture"
+    version: ClassVar[int] = 1
+    Config: ClassVar[Any] = Annotated[
+        StreetCaptureConfig | NerfstudioConfig | ColmapConfig | PandasetConfig, Field(discriminator="name")
+    ]
+    reasons: ClassVar[dict[str, str]] = {
+        "no_pose": "the frame has no camera pose, or one of another shape",
+        "left_handed": "the axes of its pose are mirrored",
+        "scaled": "the axes of its pose are not of length 1",
+        "not_rigid": "the axes of its pose are not at right angles",
+        "not_finite": "a number of its pose is infinite or none",
+        "no_intrinsics": "focal length, size or distortion is missing or makes no sense",
+        "no_image": "the image is missing",
+        "no_mask": "the mask that it names is missing",
+        "no_points": "a file of points holds none",
+        "unreadable": "the file is truncated, malformed or of a kind that is not read",
+        "unsafe_path": "it names a file outside the capture's folder",
+        "size": "the image has another size than its intrinsics",
+        "mask_size": "the mask has another size than the image",
+        "too_large": "the file is over the configured limits",
+    }
+    limits: ClassVar[dict[str, float]] = {"cpu_s": 600.0, "wall_s": 1800.0, "memory_gb": 8.0}
+
+    def slug(self, config: StageConfig) -> str:
+        return config.preset if isinstance(config, StreetCaptureConfig) else config.name
+
+    def identity(self, config: StageConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
+        source = _source(config)
+        return source.hashes(hash_file) if isinstance(source, FolderSource) else {}
+
+    def environment(self, config: StageConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
+        from stages.graphics.mitsuba.backend import choose
+
+        return choose(config.backend, previous) if isinstance(config, StreetCaptureConfig) else {}
+
+    def same_environment(self, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+        from stages.graphics.mitsuba.backend import same
+
+        return same(dict(one), dict(other)) if one and other else one == other
+
+    def max_workers(self, config: StageConfig, environment: dict[str, Any]) -> int | None:
+        from stages.graphics.mitsuba.backend import max_workers
+
+        return max_workers(environment) if environment else None
+
+    def part_size(self, config: StageConfig, inputs: Inputs) -> int:
+        return 4 if isinstance(config, StreetCaptureConfig) else 16  # a path traced frame takes seconds
+
+    def items(self, config: StageConfig, inputs: Inputs) -> Iterable[Item]:
+        return [Item(id, group) for id, group in _source(config).items()]
+
+    def prepare(self, config: StageConfig, inputs: Inputs, folder: Path) -> None:
+        """The made-up place, which all workers look at."""
+        if isinstance(config, StreetCaptureConfig):
+            from stages.neuras.street import source
+
+            source.prepare(config, folder)
+
+    def open_prepared(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any], folder: Path) -> Source:
+        if not isinstance(config, StreetCaptureConfig):
+            return _source(config)
+        from stages.graphics.mitsuba import backend
+        from stages.neuras.street.source import StreetSource
+
+        backend.activate(environment, threads=1)
+        return StreetSource(config, folder)
+
+    def process(self, worker: Source, item: Item) -> Iterator[Record]:
+        record = worker.points(item.id) if item.id.startswith(POINTS) else worker.frame(item.id)
+        yield record.to_record()
+
+    def finish(self, config: StageConfig, inputs: Inputs, draft: Draft) -> None:
+        from stages.neuras.captures import sheet
+
+        source = _source(config)
+        info = source.info()
+        (draft.files / "capture.json").write_bytes(pack_json(info.to_json()))
+        mesh = source.mesh()
+        if mesh is not None:
+            save(draft.files / "mesh.npz", mesh)
+        place = sheet.Place(info, [record.points for record in point_sets(draft)], mesh)
+        views = [replace(frame, picture=b"", depth=None) for frame in frames(draft)]  # pictures may be many
+        shown = [FrameRecord.from_record(draft.read(views[index].id)) for index in sheet.chosen(len(views))]
+        (draft.files / "contact.png").write_bytes(sheet.drawn(views, shown, place))
+        draft.note("summary", sheet.summary(views, place))
+        if info.units == "arbitrary":
+            nominal = f"a hundredth of the capture's radius, {info.metre:.4g}, stands for a metre"
+            draft.log(f"unit unknown ({info.source['units_from']}): {nominal}. If the set is in metres: capture.units=metre")
+
+    def check(self, draft: Draft) -> None:
+        if not draft.ids("train"):
+            raise UserError("no training frame is left: see the rejected frames' reasons above")
+
+
+def _source(config: StageConfig) -> Source:
+    from stages.neuras.captures import colmap, nerfstudio, pandaset
+    from stages.neuras.street.source import StreetSource
+
+    if isinstance(config, StreetCaptureConfig):
+        return StreetSource(config)
+
+    readers = {"nerfstudio": nerfstudio.read, "colmap": colmap.read, "pandaset": pandaset.read}
+    return FolderSource(config, readers[config.name])

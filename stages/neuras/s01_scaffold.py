@@ -1,0 +1,150 @@
+"""Stage scaffold: a mesh of moderate quality that the textures lie on (section 3.1).
+
+Reads a capture's given mesh, or its points and cameras; writes one record "mesh". The mesh is clustered, decimated by QSlim
+and culled. Culling by the source cameras alone leaves holes a lane farther, so virtual cameras beside them look too.
+A map stage of one item, so that the limits on time and memory hold for the native libraries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.config import StageConfig
+from pipeline.errors import Reject, UserError
+from pipeline.stage import Inputs, Item, MapStage, Record
+from stages.graphics.arrays import pack_arrays, pack_json, unpack_arrays, unpack_json
+
+if TYPE_CHECKING:
+    from pipeline.store import Artifact, Draft
+    from stages.neuras.records import CaptureInfo, FrameRecord, Mesh
+
+
+class ScaffoldConfig(StageConfig):
+    """Lengths end in ``_m``: metres, or nominal metres where the capture's unit is unknown (``CaptureInfo.metre``)."""
+
+    source: Literal["auto", "given", "poisson", "terrain"] = "auto"  # auto: given mesh, else Poisson, terrain under a flight
+    voxel_m: float = Field(0.08, gt=0)  # points are thinned to one per voxel
+    neighbours: int = Field(12, ge=4, le=64)  # of a point, for its normal
+    depth: int = Field(10, ge=5, le=13)  # levels of Poisson's octree
+    trim_m: float = Field(0.6, gt=0)  # reconstructed surface farther than this from all points goes
+    longest_m: float = Field(8.0, gt=0)  # longest side of a triangle of terrain, seen from above
+    weld_m: float = Field(0.02, gt=0)  # vertices in one cell of this size become one
+    faces: int | None = Field(60_000, ge=100)  # about this many after QSlim; null: all
+    speck_faces: int = Field(25, ge=0)  # connected pieces of fewer faces go
+    cull: bool = True  # drop faces that no camera sees
+    cull_rays: int = Field(2, ge=1, le=4)  # rays through a pixel, in both directions
+    cull_shifts_m: tuple[float, ...] = (-4.0, -2.0, 2.0, 4.0)  # virtual cameras to the right of the source cameras
+    cull_rings: int = Field(1, ge=0, le=5)  # rings of faces kept around what is seen
+
+
+class Scaffold(MapStage):
+    name: ClassVar[str] = "scaffold"
+    version: ClassVar[int] = 1
+    inputs: ClassVar[tuple[str, ...]] = ("capture",)
+    Config: ClassVar[Any] = ScaffoldConfig
+    reasons: ClassVar[dict[str, str]] = {"empty": "no face is left: points too sparse, or cameras that see nothing of it"}
+    limits: ClassVar[dict[str, float]] = {"cpu_s": 7200.0, "wall_s": 14400.0, "memory_gb": 20.0}
+
+    def slug(self, config: ScaffoldConfig) -> str:
+        return "all" if config.faces is None else f"{max(config.faces // 1000, 1)}k"
+
+    def items(self, config: ScaffoldConfig, inputs: Inputs) -> Iterable[Item]:
+        return [Item("mesh")]
+
+    def max_workers(self, config: ScaffoldConfig, environment: dict[str, Any]) -> int:
+        return 1
+
+    def open(self, config: ScaffoldConfig, inputs: Inputs, environment: dict[str, Any]) -> Any:
+        from stages.graphics.geometry import one_thread
+
+        one_thread()
+        return config, inputs["capture"]
+
+    def process(self, worker: Any, item: Item) -> Iterator[Record]:
+        from stages.neuras.records import CaptureInfo, frames
+        from stages.neuras.surfaces import simplify, visibility
+
+        config, capture = worker
+        info = CaptureInfo.of(capture)
+        views = list(frames(capture, "train"))
+        mesh, source = _surface(config, capture, info, views)
+        faces = {"source": len(mesh.faces)}
+        mesh = simplify.weld(mesh, config.weld_m * info.metre)
+        faces["welded"] = len(mesh.faces)
+        if config.faces is not None and len(mesh.faces) > config.faces:
+            mesh = simplify.collapse(mesh, config.faces)
+        faces["collapsed"] = len(mesh.faces)
+        if config.cull and len(mesh.faces):
+            shifts = [shift * info.metre for shift in config.cull_shifts_m]
+            cameras = visibility.cameras_beside((view.camera for view in views), shifts)
+            mesh = visibility.kept_faces(mesh, visibility.seen(mesh, cameras, config.cull_rays), config.cull_rings)
+            faces["seen"] = len(mesh.faces)
+        if len(mesh.faces):
+            mesh = simplify.without_specks(mesh, config.speck_faces)
+        if not len(mesh.faces):
+            raise Reject("empty", f"faces after each step: {faces}")
+        meta = {"source": source, "faces": faces | {"kept": len(mesh.faces)}, "vertices": len(mesh.vertices)}
+        arrays = pack_arrays({"vertices": mesh.vertices, "faces": mesh.faces})
+        yield Record(item.id, {"mesh.npz": arrays, "mesh.json": pack_json(meta)})
+
+    def finish(self, config: ScaffoldConfig, inputs: Inputs, draft: Draft) -> None:
+        for row in draft.rows():
+            draft.note("summary", unpack_json(draft.read(row.id).members["mesh.json"]))
+
+
+def scaffold_mesh(scaffold: Artifact) -> Mesh:
+    """The mesh of a *scaffold* artifact."""
+    from stages.neuras.records import Mesh
+
+    return Mesh(**unpack_arrays(scaffold.read("mesh").members["mesh.npz"]))
+
+
+def _surface(
+    config: ScaffoldConfig, capture: Artifact, info: CaptureInfo, views: list[FrameRecord]
+) -> tuple[Mesh, dict[str, Any]]:
+    """The mesh to simplify, and how it came about."""
+    from stages.neuras.records import given_mesh
+    from stages.neuras.surfaces import reconstruct
+
+    given = given_mesh(capture)
+    looking = np.mean([-view.camera.camera_to_world[:3, 2] for view in views], axis=0)
+    source = config.source
+    if source == "auto":
+        from_above = float(looking @ np.array(info.up)) < -0.5
+        source = "given" if given is not None else "terrain" if from_above and info.points == "sfm" else "poisson"
+    if source == "given":
+        if given is None:
+            raise UserError("scaffold.source=given, and the capture has no mesh: capture.mesh=FILE, or scaffold.source=poisson")
+        return given, {"source": "given"}
+    points, viewers = _points(capture, views)
+    if len(points) < 100:
+        raise UserError(f"the capture has {len(points)} points, too few for a surface: give it a mesh (capture.mesh=FILE)")
+    voxel = config.voxel_m * info.metre
+    points, viewers = reconstruct.thin(points, voxel, viewers)
+    stated = {"source": source, "points": len(points)}
+    if source == "terrain":
+        return reconstruct.terrain(points, np.array(info.up), config.longest_m * info.metre), stated
+    point_normals = reconstruct.normals(points, viewers, config.neighbours)
+    return reconstruct.poisson(points, point_normals, config.depth, config.trim_m * info.metre), stated
+
+
+def _points(capture: Artifact, views: list[FrameRecord]) -> tuple[np.ndarray, np.ndarray]:
+    """All points (P, 3), and where each was seen from (P, 3): its sweep's sensor, or the nearest camera."""
+    from scipy.spatial import cKDTree
+
+    from stages.neuras.records import point_sets
+
+    positions = np.array([view.camera.position for view in views])
+    points, viewers = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for record in point_sets(capture):
+        these = record.points[np.isfinite(record.points).all(axis=1)].astype(np.float64)
+        points.append(these)
+        if record.sensor is None:
+            viewers.append(positions[cKDTree(positions).query(these)[1]])
+        else:
+            viewers.append(np.broadcast_to(record.sensor, these.shape))
+    return np.concatenate(points), np.concatenate(viewers)

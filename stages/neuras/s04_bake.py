@@ -1,0 +1,64 @@
+"""Stage bake: a fitted scene as files that draw in real time (section 3.4).
+
+Reads fit's maps and networks, atlas' mesh and capture's frames; writes ``site/``, a folder that is a complete web site
+and holds what another engine needs (``stages.neuras.baking.site`` lists it). One template makes the shaders of both.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.config import StageConfig
+from pipeline.errors import UserError
+from pipeline.stage import Inputs, RunStage
+
+if TYPE_CHECKING:
+    from pipeline.store import Draft
+
+
+class BakeConfig(StageConfig):
+    textures: Literal["fp16", "rgba8"] = "fp16"  # what the loader makes of codes; eight bits take half the memory
+    frames: int = Field(60, ge=1)  # at most so many photos on the page, spread over the capture
+    largest: int = Field(8192, ge=256)  # texels along a side that devices are expected to take
+
+
+class Bake(RunStage):
+    name: ClassVar[str] = "bake"
+    version: ClassVar[int] = 1
+    inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas", "fit")
+    Config: ClassVar[Any] = BakeConfig
+    headline: ClassVar[str | None] = "site/index.html"
+
+    def slug(self, config: BakeConfig) -> str:
+        return config.textures
+
+    def run(self, config: BakeConfig, inputs: Inputs, draft: Draft) -> list[str]:
+        from model.neuras.baked import Baked
+        from stages.neuras.baking import site
+        from stages.neuras.records import CaptureInfo, frames, load_atlas
+
+        capture = inputs["capture"]
+        baked = Baked.load(inputs["fit"].path / "files")
+        atlas = load_atlas(inputs["atlas"].file("atlas.npz"))
+        largest = max(atlas.width, atlas.height)
+        if largest > config.largest:
+            raise UserError(
+                f"the texture is {atlas.width} x {atlas.height} texels, and bake.largest={config.largest}: lower atlas.size or "
+                "atlas.max_megatexels, or raise bake.largest for devices that take more"
+            )
+        info = CaptureInfo.of(capture)
+        views = list(frames(capture))
+        shown = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, config.frames).round().astype(int))]
+        sizes = site.write_site(
+            draft.files / "site", baked, atlas, info, shown, depth_range(atlas.vertices, info.metre), config.textures
+        )
+        draft.note("summary", {"megabytes": {kind: round(size / 1e6, 3) for kind, size in sizes.items()}})
+        return sorted(path.relative_to(draft.files).as_posix() for path in draft.files.rglob("*") if path.is_file())
+
+
+def depth_range(vertices: np.ndarray, metre: float) -> tuple[float, float]:
+    """Near and far plane in world units: a tenth of a metre, and beyond the mesh from anywhere within it."""
+    return 0.1 * metre, float(2 * np.linalg.norm(np.ptp(vertices, axis=0)) + metre)

@@ -1,0 +1,86 @@
+"""A surface through points. Lengths are in world units."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import Delaunay, cKDTree
+
+from stages.graphics.geometry import measure
+from stages.neuras.records import Mesh
+
+
+def thin(points: np.ndarray, voxel: float, *others: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The first point of every occupied voxel, in the order of the points, and the same rows of ``others``."""
+    cells = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64)
+    _, first = np.unique(cells @ _strides(cells), return_index=True)
+    rows = np.sort(first)
+    return tuple(array[rows] for array in (points, *others))
+
+
+def _strides(cells: np.ndarray) -> np.ndarray:
+    """Factors that make one number of three cell numbers."""
+    width, depth, _ = cells.max(axis=0) + 1
+    return np.array([1, width, width * depth], np.int64)
+
+
+def normals(points: np.ndarray, viewers: np.ndarray, neighbours: int) -> np.ndarray:
+    """(P, 3) unit normals: the least axis of each point's nearest neighbours, turned towards ``viewers`` (P, 3)."""
+    tree = cKDTree(points)
+    result = np.empty_like(points, dtype=np.float64)
+    for start in range(0, len(points), 100_000):  # neighbours of all points at once would take gigabytes
+        block = slice(start, start + 100_000)
+        near = points[tree.query(points[block], k=min(neighbours, len(points)))[1]]
+        offsets = near - near.mean(axis=1, keepdims=True)
+        result[block] = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
+    away = np.einsum("ij,ij->i", result, viewers - points) < 0
+    result[away] *= -1
+    return result
+
+
+def poisson(points: np.ndarray, point_normals: np.ndarray, depth: int, trim: float) -> Mesh:
+    """Screened Poisson reconstruction, an octree of ``depth`` levels; what lies farther than ``trim`` from all points goes."""
+    import pymeshlab
+
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points.astype(np.float64), v_normals_matrix=point_normals))
+    meshes.generate_surface_reconstruction_screened_poisson(
+        visiblelayer=False,
+        depth=depth,
+        fulldepth=5,
+        cgdepth=0,
+        scale=1.1,
+        samplespernode=1.5,
+        pointweight=4.0,
+        iters=8,
+        confidence=False,
+        preclean=False,
+        threads=1,  # more threads sum in another order
+    )
+    mesh = meshes.current_mesh()
+    vertices, faces = mesh.vertex_matrix(), np.asarray(mesh.face_matrix(), np.int64)
+    near = cKDTree(points).query(vertices, distance_upper_bound=trim)[0] <= trim
+    return _mesh(vertices, faces[near[faces].all(axis=1)])
+
+
+def terrain(points: np.ndarray, up: np.ndarray, longest: float) -> Mesh:
+    """A Delaunay triangulation of the points as seen from above, for what is flat, such as a flight's points.
+
+    Points that stand out from their neighbours' median height by more than ``longest`` are outliers and go, and so do
+    triangles with a side seen from above longer than that.
+    """
+    across = np.linalg.svd(up[None])[2][1:]
+    plan, height = points @ across.T, points @ up
+    near = cKDTree(plan).query(plan, k=min(9, len(plan)))[1]
+    kept = np.abs(height - np.median(height[near], axis=1)) <= longest
+    points, plan = points[kept], plan[kept]
+    faces = Delaunay(plan).simplices.astype(np.int64)
+    sides = np.linalg.norm(plan[faces] - plan[faces[:, [1, 2, 0]]], axis=-1).max(axis=1)
+    faces = faces[sides <= longest]
+    downward = measure.face_vectors(points, faces) @ up < 0
+    faces[downward] = faces[downward][:, [0, 2, 1]]
+    return _mesh(points, faces)
+
+
+def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    vertices, faces = measure.compact(vertices, faces)
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))

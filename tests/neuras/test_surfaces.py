@@ -1,0 +1,179 @@
+"""From points to a surface, and from a surface to an atlas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from stages.graphics.cameras import Camera
+from stages.neuras.rasterizing.casting import Caster
+from stages.neuras.rasterizing.texels import texels
+from stages.neuras.records import Mesh
+from stages.neuras.surfaces import reconstruct, simplify, unfold, visibility
+
+
+def sphere(subdivisions: int = 3, radius: float = 2.0) -> Mesh:
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return Mesh(np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.int32))
+
+
+def looking_at_origin(position: tuple[float, float, float], width: int = 64, height: int = 48) -> Camera:
+    back = np.array(position, float)
+    back /= np.linalg.norm(back)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    pose[:3, 3] = position
+    return Camera.from_fov(width, height, 60, pose)
+
+
+def test_a_ray_through_a_pixel_hits_what_projects_there():
+    mesh, camera = sphere(), looking_at_origin((6.0, 2.0, 3.0))
+    view = Caster(mesh.vertices, mesh.faces).view(camera)
+    points = view.interpolate(mesh.faces, mesh.vertices)[view.hit]
+    pixels, ahead = camera.project(points)
+    assert view.hit.sum() > 300
+    assert np.abs(pixels - camera.pixel_centres()[view.hit]).max() < 1e-3
+    assert np.allclose(np.linalg.norm(points - camera.position, axis=1), view.depth[view.hit], atol=1e-4)
+    assert (ahead > 0).all()
+
+
+def test_far_from_the_origin_hits_are_as_exact():
+    mesh, camera = sphere(), looking_at_origin((6.0, 2.0, 3.0))
+    far = np.array([500_000.0, -4_000_000.0, 100.0])
+    pose = camera.camera_to_world.copy()
+    pose[:3, 3] += far
+    near = Caster(mesh.vertices, mesh.faces).view(camera)
+    away = Caster(mesh.vertices + far, mesh.faces).view(Camera(*list(vars(camera).values())[:6], pose))
+    assert (near.face == away.face).mean() > 0.99
+    both = near.hit & (near.face == away.face)
+    assert np.abs(near.depth - away.depth)[both].max() < 1e-3
+
+
+def test_thinning_keeps_the_first_point_of_each_voxel():
+    points = np.array([[0.01, 0, 0], [0.02, 0, 0], [0.5, 0, 0], [0.51, 0, 0], [0, 0, 0.9]])
+    kept, ids = reconstruct.thin(points, 0.1, np.arange(5))
+    assert ids.tolist() == [0, 2, 4] and np.array_equal(kept, points[[0, 2, 4]])
+
+
+def test_normals_point_to_who_saw_the_point():
+    points = sphere(4).vertices.astype(float)
+    outward = reconstruct.normals(points, points * 3, 12)
+    inward = reconstruct.normals(points, points * 0, 12)
+    radial = points / np.linalg.norm(points, axis=1, keepdims=True)
+    assert np.einsum("ij,ij->i", outward, radial).min() > 0.98
+    assert np.einsum("ij,ij->i", inward, radial).max() < -0.98
+
+
+def test_poisson_finds_the_sphere_and_trims_what_no_point_supports():
+    points = sphere(4).vertices.astype(float)
+    half = points[points[:, 2] > 0]
+    mesh = reconstruct.poisson(half, half / np.linalg.norm(half, axis=1, keepdims=True), 6, 0.2)
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    assert len(mesh.faces) > 500
+    assert np.median(np.abs(radii - 2)) < 0.03
+    assert mesh.vertices[:, 2].min() > -0.3  # Poisson closes the lower half, far from any point
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)])
+def test_terrain_faces_up_and_drops_outliers(up):
+    x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
+    flat = np.stack([x.ravel(), y.ravel(), np.sin(x / 3).ravel()], axis=1)
+    axes = np.linalg.svd(np.array(up)[None])[2][1:]
+    points = flat[:, :1] * axes[0] + flat[:, 1:2] * axes[1] + flat[:, 2:] * np.array(up)
+    points = np.concatenate([points, points[:1] + 50 * np.array(up)])
+    mesh = reconstruct.terrain(points, np.array(up), 3.0)
+    assert len(mesh.vertices) == 400
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    assert (np.cross(b - a, c - a) @ np.array(up)).min() > 0
+
+
+def test_welding_and_collapsing_keep_the_shape():
+    soup = Mesh(*[np.ascontiguousarray(part) for part in _soup(sphere(4))])
+    welded = simplify.weld(soup, 1e-4)
+    assert len(welded.vertices) == len(sphere(4).vertices) and len(welded.faces) == len(soup.faces)
+    small = simplify.collapse(welded, 500)
+    assert 300 < len(small.faces) <= 520
+    assert np.abs(np.linalg.norm(small.vertices, axis=1) - 2).max() < 0.1
+
+
+def _soup(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    return mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3)
+
+
+def test_specks_go_and_bodies_stay():
+    ball, chip = sphere(2), Mesh(np.eye(3, dtype=np.float32) + 9, np.array([[0, 1, 2]], np.int32))
+    both = Mesh(np.concatenate([ball.vertices, chip.vertices]), np.concatenate([ball.faces, chip.faces + len(ball.vertices)]))
+    assert len(simplify.without_specks(both, 5).faces) == len(ball.faces)
+    assert len(simplify.without_specks(both, 1).faces) == len(both.faces)
+
+
+def test_culling_drops_the_far_side_and_keeps_what_cameras_beside_see():
+    mesh, camera = sphere(4), looking_at_origin((8.0, 0.0, 0.0), 128, 96)
+    one = visibility.seen(mesh, [camera], 2)
+    beside = visibility.seen(mesh, visibility.cameras_beside([camera], (-3.0, 3.0)), 2)
+    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    assert one[centres[:, 0] > 1.2].mean() > 0.9 and not one[centres[:, 0] < -0.2].any()
+    assert (beside | ~one).all() and beside.sum() > one.sum()
+    kept = visibility.kept_faces(mesh, one, 1)
+    assert one.sum() < len(kept.faces) < len(mesh.faces)
+
+
+def test_pixels_per_unit_grow_as_the_camera_comes_nearer():
+    mesh = sphere(3)
+    near, far = (visibility.pixels_per_unit(mesh, [looking_at_origin((d, 0.0, 0.0))]).max() for d in (4.0, 8.0))
+    assert near == pytest.approx(far * 3, rel=0.02)  # the surface lies 2 nearer than the centre
+
+
+@pytest.fixture(scope="module")
+def atlas():
+    mesh = sphere(3)
+    rows = unfold.tiles(mesh, 400)
+    assert len(rows) == 4 and np.array_equal(np.sort(np.concatenate(rows)), np.arange(len(mesh.faces)))
+    return mesh, unfold.pack([unfold.unfold(mesh, r, 20.0, 2) for r in rows], 2)
+
+
+def test_an_atlas_is_the_same_surface(atlas):
+    mesh, flat = atlas
+    assert np.allclose(flat.vertices[flat.faces], mesh.vertices[mesh.faces], atol=1e-6)
+    assert flat.width % 4 == 0 and flat.height % 4 == 0
+    assert flat.uvs.min() >= 0 and flat.uvs.max() <= 1
+    a, b, c = (flat.uvs[flat.faces[:, i]].astype(float) * (flat.width, flat.height) for i in range(3))
+    areas = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
+    surface = np.linalg.norm(np.cross(*(mesh.vertices[mesh.faces[:, i]] - mesh.vertices[mesh.faces[:, 0]] for i in (1, 2))), axis=1) / 2
+    assert np.median(np.sqrt(areas / surface)) == pytest.approx(20.0, rel=0.1)
+
+
+def test_no_bilinear_footprint_leaves_its_chart(atlas):
+    _, flat = atlas
+    drawn = texels(flat)
+    chart = np.where(drawn.face >= 0, flat.charts[drawn.face], -1)
+    chart = drawn.dilated(chart, 3)
+    rng = np.random.default_rng(0)
+    weights = rng.dirichlet([1, 1, 1], size=(len(flat.faces), 8))
+    points = np.einsum("fsk,fkd->fsd", weights, flat.uvs[flat.faces].astype(float)) * (flat.width, flat.height)
+    corner = np.floor(points - 0.5).astype(int)
+    for dx in (0, 1):
+        for dy in (0, 1):
+            found = chart[np.clip(corner[..., 1] + dy, 0, flat.height - 1), np.clip(corner[..., 0] + dx, 0, flat.width - 1)]
+            assert (found == flat.charts[:, None]).mean() > 0.999
+
+
+def test_a_fixed_size_is_kept_and_holds_all(atlas):
+    mesh, _ = atlas
+    parts = [unfold.unfold(mesh, rows, 60.0, 2) for rows in unfold.tiles(mesh, 400)]
+    flat = unfold.pack(parts, 2, size=256)
+    assert (flat.width, flat.height) == (256, 256) and flat.uvs.max() <= 1
+
+
+def test_tiles_do_not_overlap_in_the_texture(atlas):
+    _, flat = atlas
+    drawn = texels(flat)
+    assert 0.4 < (drawn.face >= 0).mean() < 1
+    centre = np.einsum("fkd->fd", flat.uvs[flat.faces].astype(float)) / 3 * (flat.width, flat.height)
+    column, row = np.floor(centre).astype(int).T
+    same = drawn.face[row, column] == np.arange(len(flat.faces))
+    neighbours = flat.charts[drawn.face[row, column]] == flat.charts
+    assert (same | neighbours).all()
