@@ -114,7 +114,13 @@ def _shape(mi: Any, group: Group) -> Any:
     if group.kind == "matt":
         surface: dict[str, Any] = {"type": "diffuse", "reflectance": texture}
     elif group.kind == "gloss":
-        surface = {"type": "roughplastic", "diffuse_reflectance": texture, "int_ior": INDEX, "alpha": group.roughness, "nonlinear": False}
+        surface = {
+            "type": "roughplastic",
+            "diffuse_reflectance": texture,
+            "int_ior": INDEX,
+            "alpha": group.roughness,
+            "nonlinear": False,
+        }
     else:
         surface = {"type": "roughconductor", "alpha": group.roughness, "specular_reflectance": texture, "material": "none"}
     properties = mi.Properties()
