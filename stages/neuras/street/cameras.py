@@ -42,7 +42,7 @@ def start(config: StreetConfig) -> float:
 
 
 def look(config: StreetConfig, position: np.ndarray, ahead: np.ndarray) -> Camera:
-    """A camera at ``position`` that looks along ``ahead`` (3,), world; the image's up is the world's, or +y when looking down."""
+    """A camera at ``position`` that looks along ``ahead`` (3,), world. Its up is the world's, or +y when it looks down."""
     back = -np.asarray(ahead, float) / np.linalg.norm(ahead)
     up = np.array([0.0, 1.0, 0.0]) if abs(back[2]) > 0.999 else np.array([0.0, 0.0, 1.0])
     right = np.cross(up, back)

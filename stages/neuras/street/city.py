@@ -1,7 +1,7 @@
 """A city made of numbers: a street of houses (``street``) or blocks with gardens (``drone``), from a seed.
 
-World: metres, right-handed, z up. The street runs along x and its middle is y = 0; the road's surface is z = 0. All that is far, the
-skyline, lies at least FAR metres beyond what the cameras are driven through.
+World: metres, right-handed, z up. The street runs along x and its middle is y = 0; the road's surface is z = 0. The skyline
+lies about FAR metres and more beyond the street's ends.
 """
 
 from __future__ import annotations
@@ -48,8 +48,10 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class City:
-    """groups: by material. sky: (H, W, 3) float32 radiance, row 0 at the zenith, column 0 towards +y, then clockwise from above.
-    sun: unit vector towards it. houses: how many near buildings."""
+    """groups: by material. sky: (H, W, 3) float32 radiance, row 0 at the zenith, column 0 towards +y, then clockwise.
+
+    sun: unit vector towards it. houses: how many buildings stand along the streets.
+    """
 
     groups: tuple[Group, ...]
     sky: np.ndarray
@@ -152,12 +154,21 @@ def _palette(rng: np.random.Generator) -> dict[str, tuple[Maker, str, float, flo
     small |= {f"cloth{k}": t.speckled(t.hue(rng, (0, 1), (0.5, 0.9), (0.4, 0.8)), 0.06) for k in range(3)}
     small |= {f"leaves{k}": t.leaves for k in range(3)}
     small |= {
-        "cloth3": t.speckled([0.9, 0.88, 0.8]), "flowers": t.speckled(t.hue(rng, (-0.1, 0.15), (0.6, 0.95), (0.7, 0.95)), 0.25),
-        "kerb": t.speckled([0.56, 0.55, 0.52], 0.12), "soil": t.speckled([0.3, 0.24, 0.18], 0.25), "clay": t.speckled([0.65, 0.36, 0.25], 0.1),
-        "paintwhite": t.speckled([0.85, 0.85, 0.82], 0.13), "paintyellow": t.speckled([0.85, 0.7, 0.2], 0.1), "iron": t.speckled([0.17, 0.18, 0.19], 0.15),
-        "tyre": t.speckled([0.09, 0.09, 0.09], 0.1), "plate_white": t.speckled([0.9, 0.9, 0.88]), "manhole": t.speckled([0.24, 0.23, 0.22], 0.3),
-        "green": t.speckled([0.12, 0.36, 0.22], 0.1), "yellow": t.speckled([0.9, 0.66, 0.1]), "pool": t.speckled([0.3, 0.66, 0.78], 0.08),
-    }  # fmt: skip
+        "cloth3": t.speckled([0.9, 0.88, 0.8]),
+        "flowers": t.speckled(t.hue(rng, (-0.1, 0.15), (0.6, 0.95), (0.7, 0.95)), 0.25),
+        "kerb": t.speckled([0.56, 0.55, 0.52], 0.12),
+        "soil": t.speckled([0.3, 0.24, 0.18], 0.25),
+        "clay": t.speckled([0.65, 0.36, 0.25], 0.1),
+        "paintwhite": t.speckled([0.85, 0.85, 0.82], 0.13),
+        "paintyellow": t.speckled([0.85, 0.7, 0.2], 0.1),
+        "iron": t.speckled([0.17, 0.18, 0.19], 0.15),
+        "tyre": t.speckled([0.09, 0.09, 0.09], 0.1),
+        "plate_white": t.speckled([0.9, 0.9, 0.88]),
+        "manhole": t.speckled([0.24, 0.23, 0.22], 0.3),
+        "green": t.speckled([0.12, 0.36, 0.22], 0.1),
+        "yellow": t.speckled([0.9, 0.66, 0.1]),
+        "pool": t.speckled([0.3, 0.66, 0.78], 0.08),
+    }
     paints = [
         [0.75, 0.75, 0.77],
         [0.08, 0.09, 0.1],

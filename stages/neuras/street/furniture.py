@@ -11,7 +11,8 @@ from stages.neuras.street.buildings import planter
 from stages.neuras.street.shapes import Shapes
 from stages.neuras.street.textures import cell
 
-# Outlines of cars, metres: length, width, height, height of the belt; then x of the cabin's base and roof, as shares of the length.
+# Outlines of cars, metres: length, width, height, height of the belt. Then x of the cabin's base and roof, as shares of the
+# length.
 CARS = {
     "hatchback": (4.0, 1.75, 1.48, 0.92, (0.06, 0.72), (0.14, 0.52)),
     "saloon": (4.7, 1.82, 1.45, 0.93, (0.16, 0.72), (0.28, 0.56)),

@@ -1,6 +1,7 @@
 """Frames of a city: path traced by Mitsuba, denoised, exposed and encoded.
 
-A frame's samples are seeded by its id and drawn on one thread, so its bytes depend neither on order nor on the number of workers.
+A frame's samples are seeded by its id and drawn on one thread, so its bytes depend neither on order nor on the number of
+workers.
 """
 
 from __future__ import annotations

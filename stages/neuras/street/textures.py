@@ -89,7 +89,10 @@ def _weathered(rng: np.random.Generator, colours: np.ndarray, stains: float = 1.
 def _courses(
     rng: np.random.Generator, size: int, rows: int, columns: int, joint: float, stagger: float = 0.5
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Blocks laid in courses: (S, S) a random number per block, and where the joints are. ``joint``: share of a course's height."""
+    """Blocks laid in courses: (S, S) a random number per block, and where the joints are.
+
+    ``joint``: share of a course's height.
+    """
     v, u = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size, indexing="ij")
     row = np.floor(v * rows).astype(int)
     along = u * columns + stagger * (row % 2)
