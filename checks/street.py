@@ -11,6 +11,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from stages.graphics.mitsuba import backend
 from stages.neuras.street.settings import StreetConfig
 from stages.neuras.street.source import StreetSource, prepare
 
@@ -22,6 +23,7 @@ ROWS = (
 
 
 def main(out: str) -> None:
+    backend.activate(backend.choose(), threads=1)
     width, height = ROWS[0][0].width, ROWS[0][0].height
     sheet = Image.new("RGB", (2 * width, len(ROWS) * height))
     for row, (config, ids) in enumerate(ROWS):

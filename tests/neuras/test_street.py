@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 from pydantic import ValidationError
 
+from stages.graphics.mitsuba import backend
 from stages.neuras.rasterizing.casting import Caster
 from stages.neuras.street import lidar
 from stages.neuras.street.cameras import poses
@@ -28,6 +29,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def source(folder):
+    backend.activate(backend.choose(), threads=1)
     return StreetSource(SMALL, folder)
 
 
