@@ -16,7 +16,7 @@ from stages.neuras.street.settings import StreetConfig
 from stages.neuras.street.source import StreetSource, prepare
 
 ROWS = (
-    (StreetConfig(), ("frame-drive_0013", "frame-shift_+3m_0002")),
+    (StreetConfig(), ("frame-drive_0013", "frame-shift_3m_right_0002")),
     (StreetConfig(seed=1), ("frame-drive_0003", "frame-drive_0020")),
     (StreetConfig(preset="drone", length=200), ("frame-flight_0000", "frame-flight_0011")),
 )
