@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 from pydantic import ValidationError
 
+from stages.graphics.mitsuba import backend
 from stages.neuras.rasterizing.casting import Caster
 from stages.neuras.street import lidar
 from stages.neuras.street.cameras import poses
@@ -14,7 +15,9 @@ from stages.neuras.street.city import City, make
 from stages.neuras.street.settings import StreetConfig
 from stages.neuras.street.source import StreetSource, prepare
 
-SMALL = StreetConfig(length=90, training_frames=4, texture_size=128, width=96, height=54, spp=2, beams=12, columns=90, shift_frames=2)
+SMALL = StreetConfig(
+    length=90, training_frames=4, texture_size=128, width=96, height=54, spp=2, beams=12, columns=90, shift_frames=2
+)
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +29,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def source(folder):
+    backend.activate(backend.choose(), threads=1)
     return StreetSource(SMALL, folder)
 
 
@@ -65,7 +69,9 @@ def test_a_saved_city_reads_back(folder):
 def test_the_default_drive_keeps_its_promises():
     config = StreetConfig()
     frames = poses(config)
-    x = {split: np.array([p.camera.position[0] for p in frames if p.split == split]) for split in ("train", "test", "validation")}
+    x = {
+        split: np.array([p.camera.position[0] for p in frames if p.split == split]) for split in ("train", "test", "validation")
+    }
     assert len(x["train"]) == 16 and np.ptp(x["train"]) >= 45 and np.diff(x["train"]).max() <= 3.0
     assert len(x["test"]) >= 8 and len(x["validation"]) >= 3
     held_out = np.concatenate([x["test"], x["validation"]])
@@ -73,7 +79,9 @@ def test_the_default_drive_keeps_its_promises():
     for shift in (-3.0, -2.0, 2.0, 3.0):
         lane = [p for p in frames if p.shift == shift]
         assert len(lane) == 5 and {p.split for p in lane} == {"shift"}
-        drive = min((p for p in frames if p.trajectory == "drive"), key=lambda p: abs(p.camera.position[0] - lane[2].camera.position[0]))
+        drive = min(
+            (p for p in frames if p.trajectory == "drive"), key=lambda p: abs(p.camera.position[0] - lane[2].camera.position[0])
+        )
         offset = (lane[2].camera.position - drive.camera.position) @ drive.camera.camera_to_world[:3, 0]
         assert offset == pytest.approx(shift, abs=0.05)  # to the right
 
@@ -150,7 +158,8 @@ def test_depth_agrees_with_the_lidar(source):
 
 
 @pytest.mark.parametrize(
-    "wrong, says", [({"shifts": [4.0]}, "parked cars"), ({"length": 90, "training_frames": 40}, "length="), ({"spacing": 2.0}, "1.5")]
+    "wrong, says",
+    [({"shifts": [4.0]}, "parked cars"), ({"length": 90, "training_frames": 40}, "length="), ({"spacing": 2.0}, "1.5")],
 )
 def test_settings_that_make_no_sense_are_told(wrong, says):
     with pytest.raises(ValidationError, match=says):

@@ -42,7 +42,7 @@ def start(config: StreetConfig) -> float:
 
 
 def look(config: StreetConfig, position: np.ndarray, ahead: np.ndarray) -> Camera:
-    """A camera at ``position`` that looks along ``ahead`` (3,), world; the image's up is the world's, or +y when looking down."""
+    """A camera at ``position`` that looks along ``ahead`` (3,), world. Its up is the world's, or +y when it looks down."""
     back = -np.asarray(ahead, float) / np.linalg.norm(ahead)
     up = np.array([0.0, 1.0, 0.0]) if abs(back[2]) > 0.999 else np.array([0.0, 0.0, 1.0])
     right = np.cross(up, back)
@@ -65,14 +65,18 @@ def _street(config: StreetConfig) -> list[Pose]:
         x = first + number * config.spacing
         between = number // 2 % VALIDATION_EVERY == VALIDATION_EVERY // 2
         split: Split = "train" if number % 2 == 0 else "validation" if between else "test"
-        out.append(Pose(f"frame-drive_{number:04d}", _on_lane(config, x, 0.0), split, time=number * config.spacing / config.speed))
+        out.append(
+            Pose(f"frame-drive_{number:04d}", _on_lane(config, x, 0.0), split, time=number * config.spacing / config.speed)
+        )
     for shift in config.shifts:
         lane = f"shift_{abs(shift):g}m_{'right' if shift > 0 else 'left'}".replace(".", "_")
         # Between training frames, as the held-out frames are: nowhere beside a training camera.
         steps = np.round(np.linspace(1, 2 * config.training_frames - 3, config.shift_frames) / 2 - 0.5) * 2 + 1
         for number, step in enumerate(steps):
             camera = _on_lane(config, first + step * config.spacing, shift)
-            out.append(Pose(f"frame-{lane}_{number:04d}", camera, "shift", lane, shift, float(step * config.spacing / config.speed)))
+            out.append(
+                Pose(f"frame-{lane}_{number:04d}", camera, "shift", lane, shift, float(step * config.spacing / config.speed))
+            )
     return out
 
 
@@ -85,11 +89,17 @@ def _flight(config: StreetConfig) -> list[Pose]:
     for number in range(count):
         nadir = number % 2 == 0
         row, along = divmod(number // 2, int(np.ceil(count / 2 / rows)))
-        share = along / max(1, np.ceil(count / 2 / rows) - 1) if row % 2 == 0 else 1 - along / max(1, np.ceil(count / 2 / rows) - 1)
-        position = np.array([middle + reach * (2 * share - 1), middle + reach * (2 * row / max(1, rows - 1) - 1), 62.0 if nadir else 48.0])
+        share = (
+            along / max(1, np.ceil(count / 2 / rows) - 1) if row % 2 == 0 else 1 - along / max(1, np.ceil(count / 2 / rows) - 1)
+        )
+        position = np.array(
+            [middle + reach * (2 * share - 1), middle + reach * (2 * row / max(1, rows - 1) - 1), 62.0 if nadir else 48.0]
+        )
         inwards = np.array([middle, middle, 0]) - position
         turn = np.arctan2(inwards[1], inwards[0]) if np.hypot(*inwards[:2]) > 15 else 0.7 * row
-        cameras.append(look(config, position, np.array([0, 0, -1.0]) if nadir else np.array([np.cos(turn), np.sin(turn), -0.95])))
+        cameras.append(
+            look(config, position, np.array([0, 0, -1.0]) if nadir else np.array([np.cos(turn), np.sin(turn), -0.95]))
+        )
     order = np.random.default_rng(seed_for(config.seed, "street", "held out")).permutation(count)
     held = {int(number): place for place, number in enumerate(order[: count // 2])}
     out = []

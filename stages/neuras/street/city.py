@@ -1,7 +1,7 @@
 """A city made of numbers: a street of houses (``street``) or blocks with gardens (``drone``), from a seed.
 
-World: metres, right-handed, z up. The street runs along x and its middle is y = 0; the road's surface is z = 0. All that is far, the
-skyline, lies at least FAR metres beyond what the cameras are driven through.
+World: metres, right-handed, z up. The street runs along x and its middle is y = 0; the road's surface is z = 0. The skyline
+lies about FAR metres and more beyond the street's ends.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -48,8 +48,10 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class City:
-    """groups: by material. sky: (H, W, 3) float32 radiance, row 0 at the zenith, column 0 towards +y, then clockwise from above.
-    sun: unit vector towards it. houses: how many near buildings."""
+    """groups: by material. sky: (H, W, 3) float32 radiance, row 0 at the zenith, column 0 towards +y, then clockwise.
+
+    sun: unit vector towards it. houses: how many buildings stand along the streets.
+    """
 
     groups: tuple[Group, ...]
     sky: np.ndarray
@@ -135,28 +137,71 @@ def _palette(rng: np.random.Generator) -> dict[str, tuple[Maker, str, float, flo
     walls = [t.brick, t.plaster, t.stone, t.panels, t.plaster, t.brick, t.siding]
     matt |= {f"wall{k}": walls[k % len(walls)] for k in range(WALLS)}
     matt |= {f"roof{k}": t.tiles for k in range(ROOFS)}
-    small: dict[str, Maker] = {"bark": t.bark, "planks0": t.planks, "planks1": t.planks, "shutter0": t.shutter, "shutter1": t.shutter}
+    small: dict[str, Maker] = {
+        "bark": t.bark,
+        "planks0": t.planks,
+        "planks1": t.planks,
+        "shutter0": t.shutter,
+        "shutter1": t.shutter,
+    }
     small |= {f"trim{k}": t.speckled(t.hue(rng, (0.03, 0.16), (0.03, 0.2), (0.55, 0.92)), 0.1) for k in range(5)}
-    small |= {f"frame{k}": t.speckled(c, 0.05) for k, c in enumerate(([0.9, 0.9, 0.87], [0.33, 0.22, 0.15], [0.24, 0.3, 0.27], [0.75, 0.7, 0.6]))}
+    small |= {
+        f"frame{k}": t.speckled(c, 0.05)
+        for k, c in enumerate(([0.9, 0.9, 0.87], [0.33, 0.22, 0.15], [0.24, 0.3, 0.27], [0.75, 0.7, 0.6]))
+    }
     small |= {f"door{k}": t.speckled(t.hue(rng, (0, 1), (0.3, 0.8), (0.2, 0.6)), 0.1) for k in range(4)}
     small |= {f"shopfront{k}": t.speckled(t.hue(rng, (0, 1), (0.2, 0.7), (0.25, 0.7)), 0.1) for k in range(4)}
     small |= {f"cloth{k}": t.speckled(t.hue(rng, (0, 1), (0.5, 0.9), (0.4, 0.8)), 0.06) for k in range(3)}
     small |= {f"leaves{k}": t.leaves for k in range(3)}
     small |= {
-        "cloth3": t.speckled([0.9, 0.88, 0.8]), "flowers": t.speckled(t.hue(rng, (-0.1, 0.15), (0.6, 0.95), (0.7, 0.95)), 0.25),
-        "kerb": t.speckled([0.56, 0.55, 0.52], 0.12), "soil": t.speckled([0.3, 0.24, 0.18], 0.25), "clay": t.speckled([0.65, 0.36, 0.25], 0.1),
-        "paintwhite": t.speckled([0.85, 0.85, 0.82], 0.13), "paintyellow": t.speckled([0.85, 0.7, 0.2], 0.1), "iron": t.speckled([0.17, 0.18, 0.19], 0.15),
-        "tyre": t.speckled([0.09, 0.09, 0.09], 0.1), "plate_white": t.speckled([0.9, 0.9, 0.88]), "manhole": t.speckled([0.24, 0.23, 0.22], 0.3),
-        "green": t.speckled([0.12, 0.36, 0.22], 0.1), "yellow": t.speckled([0.9, 0.66, 0.1]), "pool": t.speckled([0.3, 0.66, 0.78], 0.08),
-    }  # fmt: skip
-    paints = [[0.75, 0.75, 0.77], [0.08, 0.09, 0.1], [0.6, 0.08, 0.08], [0.12, 0.22, 0.45], [0.88, 0.88, 0.86], [0.35, 0.37, 0.4], t.hue(rng, (0, 1), (0.5, 0.9), (0.3, 0.8)), t.hue(rng, (0, 1), (0.3, 0.6), (0.3, 0.6))]
+        "cloth3": t.speckled([0.9, 0.88, 0.8]),
+        "flowers": t.speckled(t.hue(rng, (-0.1, 0.15), (0.6, 0.95), (0.7, 0.95)), 0.25),
+        "kerb": t.speckled([0.56, 0.55, 0.52], 0.12),
+        "soil": t.speckled([0.3, 0.24, 0.18], 0.25),
+        "clay": t.speckled([0.65, 0.36, 0.25], 0.1),
+        "paintwhite": t.speckled([0.85, 0.85, 0.82], 0.13),
+        "paintyellow": t.speckled([0.85, 0.7, 0.2], 0.1),
+        "iron": t.speckled([0.17, 0.18, 0.19], 0.15),
+        "tyre": t.speckled([0.09, 0.09, 0.09], 0.1),
+        "plate_white": t.speckled([0.9, 0.9, 0.88]),
+        "manhole": t.speckled([0.24, 0.23, 0.22], 0.3),
+        "green": t.speckled([0.12, 0.36, 0.22], 0.1),
+        "yellow": t.speckled([0.9, 0.66, 0.1]),
+        "pool": t.speckled([0.3, 0.66, 0.78], 0.08),
+    }
+    paints = [
+        [0.75, 0.75, 0.77],
+        [0.08, 0.09, 0.1],
+        [0.6, 0.08, 0.08],
+        [0.12, 0.22, 0.45],
+        [0.88, 0.88, 0.86],
+        [0.35, 0.37, 0.4],
+        t.hue(rng, (0, 1), (0.5, 0.9), (0.3, 0.8)),
+        t.hue(rng, (0, 1), (0.3, 0.6), (0.3, 0.6)),
+    ]
     palette = {name: (maker, "matt", 0.5, 1.0) for name, maker in matt.items()}
     palette |= {name: (maker, "matt", 0.5, 0.5) for name, maker in small.items()}
-    palette |= {name: (t.atlas(draw), "matt", 0.5, 1.0) for name, draw in (("posters", t.draw_poster), ("signs", t.draw_sign), ("towers", t.draw_tower), ("plates", t.draw_plate))}
+    palette |= {
+        name: (t.atlas(draw), "matt", 0.5, 1.0)
+        for name, draw in (
+            ("posters", t.draw_poster),
+            ("signs", t.draw_sign),
+            ("towers", t.draw_tower),
+            ("plates", t.draw_plate),
+        )
+    }
     palette |= {name: (t.atlas(draw), "gloss", 0.05, 1.0) for name, draw in (("rooms", t.draw_window), ("goods", t.draw_shop))}
     palette |= {f"paint{k}": (t.speckled(c, 0.03), "gloss", 0.08, 0.25) for k, c in enumerate(paints)}
-    palette |= {"carglass": (t.speckled([0.2, 0.23, 0.25], 0.3), "gloss", 0.04, 0.25), "headlamp": (t.speckled([0.9, 0.9, 0.85]), "gloss", 0.1, 0.1), "taillamp": (t.speckled([0.75, 0.06, 0.05]), "gloss", 0.1, 0.1)}
-    palette |= {"chrome": (t.speckled([0.75, 0.75, 0.77]), "metal", 0.2, 0.1), "zinc": (t.speckled([0.6, 0.62, 0.64], 0.12), "metal", 0.45, 0.25), "pole": (t.speckled([0.4, 0.42, 0.43], 0.1), "metal", 0.4, 0.25)}
+    palette |= {
+        "carglass": (t.speckled([0.2, 0.23, 0.25], 0.3), "gloss", 0.04, 0.25),
+        "headlamp": (t.speckled([0.9, 0.9, 0.85]), "gloss", 0.1, 0.1),
+        "taillamp": (t.speckled([0.75, 0.06, 0.05]), "gloss", 0.1, 0.1),
+    }
+    palette |= {
+        "chrome": (t.speckled([0.75, 0.75, 0.77]), "metal", 0.2, 0.1),
+        "zinc": (t.speckled([0.6, 0.62, 0.64], 0.12), "metal", 0.45, 0.25),
+        "pole": (t.speckled([0.4, 0.42, 0.43], 0.1), "metal", 0.4, 0.25),
+    }
     return palette
 
 
@@ -190,7 +235,9 @@ def _street(shapes: Shapes, rng: np.random.Generator, length: float) -> int:
         shapes.tube("iron", (x, -FRONT, z), (x, 0, z - 0.5), (0.015, 0.015), 4)
         shapes.tube("iron", (x, 0, z - 0.5), (x, FRONT, z), (0.015, 0.015), 4)
         shapes.box("zinc", x - 0.3, -0.15, z - 0.75, x + 0.3, 0.15, z - 0.5)
-    for x, y in zip(rng.uniform(length * 0.72, length - 6, 4), (3.0, -2.2, 2.6, -2.4), strict=True):  # cars under way, far ahead
+    for x, y in zip(
+        rng.uniform(length * 0.72, length - 6, 4), (3.0, -2.2, 2.6, -2.4), strict=True
+    ):  # cars under way, far ahead
         furniture.car(shapes.at(x, y, 0, np.pi if y > 0 else 0), rng)
     return houses
 
@@ -240,7 +287,11 @@ def _side_street(shapes: Shapes, rng: np.random.Generator, sign: int, x: float) 
             width = rng.uniform(9, 12)
             style = Style.draw(rng, WALLS, ROOFS, (1, 4), rng.random() < 0.3, ("flat", "gable", "mansard"))
             low = sign * y if sign > 0 else sign * (y + width)
-            frame = shapes.at(x - CROSS / 2, low + width, KERB, -np.pi / 2) if side < 0 else shapes.at(x + CROSS / 2, low, KERB, np.pi / 2)
+            frame = (
+                shapes.at(x - CROSS / 2, low + width, KERB, -np.pi / 2)
+                if side < 0
+                else shapes.at(x + CROSS / 2, low, KERB, np.pi / 2)
+            )
             building(frame, rng, width, 10, style, (y < FRONT + 15, False))
             y += width
             count += 1
@@ -252,7 +303,9 @@ def _side_street(shapes: Shapes, rng: np.random.Generator, sign: int, x: float) 
     return count + 1
 
 
-def _ground(shapes: Shapes, rng: np.random.Generator, length: float, spans: list[tuple[float, float]], crosses: np.ndarray) -> None:
+def _ground(
+    shapes: Shapes, rng: np.random.Generator, length: float, spans: list[tuple[float, float]], crosses: np.ndarray
+) -> None:
     shapes.floor("asphalt", -60, -ROAD, length + 60, ROAD, 0.0, 9.0, 3.0)
     for sign in (-1, 1):
         for a, b in [(-60, 0.0), *spans, (length, length + 60)]:
@@ -260,7 +313,11 @@ def _ground(shapes: Shapes, rng: np.random.Generator, length: float, spans: list
             shapes.floor("pavement", a, y0, b, y1, KERB, 4.0, 2.0)
             e0, e1 = sorted((sign * (ROAD - 0.02), sign * (ROAD + 0.18)))
             stones = np.arange(a, b - 0.5, 1.0)
-            shapes.boxes("kerb", np.stack([stones, 0 * stones + e0, 0 * stones - 0.05], -1), np.stack([stones + 0.985, 0 * stones + e1, 0 * stones + KERB + 0.006], -1))
+            shapes.boxes(
+                "kerb",
+                np.stack([stones, 0 * stones + e0, 0 * stones - 0.05], -1),
+                np.stack([stones + 0.985, 0 * stones + e1, 0 * stones + KERB + 0.006], -1),
+            )
         for x in crosses:
             y0, y1 = sorted((sign * ROAD, sign * 72))
             shapes.floor("asphalt", x - 4, y0, x + 4, y1, 0.0, 9.0, 3.0)
@@ -313,7 +370,14 @@ def _pavement_things(shapes: Shapes, rng: np.random.Generator, sign: int, spans:
             elif number % 2 == 1 and rng.random() < 0.72:
                 furniture.street_tree(place(x, 0.95), rng)
             elif rng.random() < 0.8:
-                things = (furniture.bench, furniture.bin_, furniture.billboard, furniture.traffic_sign, furniture.shelter, furniture.cafe)
+                things = (
+                    furniture.bench,
+                    furniture.bin_,
+                    furniture.billboard,
+                    furniture.traffic_sign,
+                    furniture.shelter,
+                    furniture.cafe,
+                )
                 pick = int(rng.choice(6, p=[0.2, 0.2, 0.2, 0.2, 0.08, 0.12]))
                 frame = place(x, 0.9)
                 if things[pick] in (furniture.traffic_sign, furniture.billboard):
@@ -322,7 +386,9 @@ def _pavement_things(shapes: Shapes, rng: np.random.Generator, sign: int, spans:
             if rng.random() < 0.4:
                 furniture.bollard(place(x + 1.6, 0.4), rng)
             if rng.random() < 0.3:
-                (furniture.cafe if rng.random() < 0.5 else lambda frame, r: buildings.planter(frame, r, 1.2, 0.4))(place(x + 1.5, 2.6), rng)
+                (furniture.cafe if rng.random() < 0.5 else lambda frame, r: buildings.planter(frame, r, 1.2, 0.4))(
+                    place(x + 1.5, 2.6), rng
+                )
 
 
 def _parked(shapes: Shapes, rng: np.random.Generator, sign: int, spans: list[tuple[float, float]]) -> None:
@@ -330,7 +396,10 @@ def _parked(shapes: Shapes, rng: np.random.Generator, sign: int, spans: list[tup
         x = start + 4.5
         while x < end - 6:
             if rng.random() < 0.7:
-                furniture.car(shapes.at(x, sign * (PARKING + rng.normal(0, 0.05)), 0, (0 if sign < 0 else np.pi) + rng.normal(0, 0.012)), rng)
+                furniture.car(
+                    shapes.at(x, sign * (PARKING + rng.normal(0, 0.05)), 0, (0 if sign < 0 else np.pi) + rng.normal(0, 0.012)),
+                    rng,
+                )
             x += 6.0
 
 
@@ -342,7 +411,12 @@ def _skyline(shapes: Shapes, rng: np.random.Generator, length: float, preset: st
         away = reach * rng.uniform(1.02, 2.6)
         wide, deep, high = rng.uniform(14, 40), rng.uniform(14, 30), rng.uniform(12, 42) * (1 + 2.2 * (rng.random() < 0.2))
         frame = shapes.at(*(centre + away * np.array([np.cos(angle), np.sin(angle)])), -1, angle + np.pi / 2)
-        for x0, y0, x1, y1 in ((-wide, -deep, wide, -deep), (-wide, deep, wide, deep), (-wide, -deep, -wide, deep), (wide, -deep, wide, deep)):
+        for x0, y0, x1, y1 in (
+            (-wide, -deep, wide, -deep),
+            (-wide, deep, wide, deep),
+            (-wide, -deep, -wide, deep),
+            (wide, -deep, wide, deep),
+        ):
             corners = np.array([[x0, y0, 0], [x1, y1, 0], [x1, y1, high], [x0, y0, high]]) / [2, 2, 1]
             frame.pictures("towers", corners, textures.cell(int(rng.integers(16))))
         frame.box("gravel", -wide / 2, -deep / 2, high, wide / 2, deep / 2, high + 1, 6.0)

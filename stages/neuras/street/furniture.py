@@ -11,7 +11,8 @@ from stages.neuras.street.buildings import planter
 from stages.neuras.street.shapes import Shapes
 from stages.neuras.street.textures import cell
 
-# Outlines of cars, metres: length, width, height, height of the belt; then x of the cabin's base and roof, as shares of the length.
+# Outlines of cars, metres: length, width, height, height of the belt. Then x of the cabin's base and roof, as shares of the
+# length.
 CARS = {
     "hatchback": (4.0, 1.75, 1.48, 0.92, (0.06, 0.72), (0.14, 0.52)),
     "saloon": (4.7, 1.82, 1.45, 0.93, (0.16, 0.72), (0.28, 0.56)),
@@ -29,7 +30,14 @@ def tree(shapes: Shapes, rng: np.random.Generator, height: float, leaves: int = 
     shapes.tube("bark", (0, 0, 0), (0.1, 0.05, trunk), (0.035 * height, 0.024 * height), 8)
     blobs = int(rng.integers(7, 13))
     spread = height * rng.uniform(0.17, 0.25)
-    centres = np.stack([rng.normal(0, spread * 0.62, blobs), rng.normal(0, spread * 0.62, blobs), rng.uniform(trunk + 0.1 * height, height * 0.88, blobs)], -1)
+    centres = np.stack(
+        [
+            rng.normal(0, spread * 0.62, blobs),
+            rng.normal(0, spread * 0.62, blobs),
+            rng.uniform(trunk + 0.1 * height, height * 0.88, blobs),
+        ],
+        -1,
+    )
     taper = 1.15 - 0.6 * (centres[:, 2] - trunk) / (height - trunk)
     centres[:, :2] *= taper[:, None]
     for centre in centres:
@@ -39,8 +47,14 @@ def tree(shapes: Shapes, rng: np.random.Generator, height: float, leaves: int = 
     offset /= np.linalg.norm(offset, axis=1, keepdims=True)
     radius = height * 0.13 * rng.uniform(0.25, 1.15, leaves) ** 0.6
     normals = offset + rng.normal(0, 0.6, (leaves, 3)) + [0, 0, 0.4]
-    shapes.cards(f"leaves{kind}", centres[which] + offset * radius[:, None], normals / np.linalg.norm(normals, axis=1, keepdims=True),
-                 rng.uniform(0.1, 0.21, leaves) * height / 7, rng.uniform(0, 6.3, leaves), rng.random((leaves, 2)))
+    shapes.cards(
+        f"leaves{kind}",
+        centres[which] + offset * radius[:, None],
+        normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        rng.uniform(0.1, 0.21, leaves) * height / 7,
+        rng.uniform(0, 6.3, leaves),
+        rng.random((leaves, 2)),
+    )
 
 
 def street_tree(shapes: Shapes, rng: np.random.Generator) -> None:
@@ -50,7 +64,13 @@ def street_tree(shapes: Shapes, rng: np.random.Generator) -> None:
     tree(shapes, rng, rng.uniform(5.5, 8.5))
     if rng.random() < 0.5:
         for angle in np.arange(8) * np.pi / 4:
-            shapes.tube("iron", (0.4 * np.cos(angle), 0.4 * np.sin(angle), 0), (0.5 * np.cos(angle), 0.5 * np.sin(angle), 1.3), (0.015, 0.015), 4)
+            shapes.tube(
+                "iron",
+                (0.4 * np.cos(angle), 0.4 * np.sin(angle), 0),
+                (0.5 * np.cos(angle), 0.5 * np.sin(angle), 1.3),
+                (0.015, 0.015),
+                4,
+            )
 
 
 def hedge(shapes: Shapes, rng: np.random.Generator, length: float, height: float = 1.1, width: float = 0.7) -> None:
@@ -61,8 +81,14 @@ def hedge(shapes: Shapes, rng: np.random.Generator, length: float, height: float
     at = np.where(side != 0, side, at) * [length, width, height] + [0, 0, height / 2] + rng.normal(0, 0.05, (n, 3))
     normals = side * 2 + rng.normal(0, 0.5, (n, 3))
     shapes.box("soil", -length / 2, -width / 2, 0, length / 2, width / 2, height * 0.9)
-    shapes.cards(f"leaves{rng.integers(3)}", at, normals / np.linalg.norm(normals, axis=1, keepdims=True),
-                 rng.uniform(0.07, 0.14, n), rng.uniform(0, 6.3, n), rng.random((n, 2)))
+    shapes.cards(
+        f"leaves{rng.integers(3)}",
+        at,
+        normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        rng.uniform(0.07, 0.14, n),
+        rng.uniform(0, 6.3, n),
+        rng.random((n, 2)),
+    )
 
 
 def car(shapes: Shapes, rng: np.random.Generator, kind: str | None = None) -> None:
@@ -99,11 +125,32 @@ def car(shapes: Shapes, rng: np.random.Generator, kind: str | None = None) -> No
     for sign in (-1, 1):
         body.tube(paint, (middle, sign * low, z0), (middle, sign * high, z1), (0.045, 0.04), 4)
         for x in (middle, x1 - 0.15):
-            body.box("tyre", x, sign * half * 0.985 - 0.008, 0.32, x + 0.012, sign * half * 0.985 + 0.008, belt - 0.08)  # gaps of a door
-        body.box("chrome", middle - 0.35, sign * half * 0.99 - 0.02, belt - 0.2, middle - 0.18, sign * half * 0.99 + 0.02, belt - 0.16)
-        body.box(paint, x1 - 0.32, sign * (half + 0.09) - 0.08, belt + 0.02, x1 - 0.18, sign * (half + 0.09) + 0.08, belt + 0.17)
+            body.box(
+                "tyre", x, sign * half * 0.985 - 0.008, 0.32, x + 0.012, sign * half * 0.985 + 0.008, belt - 0.08
+            )  # gaps of a door
+        body.box(
+            "chrome",
+            middle - 0.35,
+            sign * half * 0.99 - 0.02,
+            belt - 0.2,
+            middle - 0.18,
+            sign * half * 0.99 + 0.02,
+            belt - 0.16,
+        )
+        body.box(
+            paint, x1 - 0.32, sign * (half + 0.09) - 0.08, belt + 0.02, x1 - 0.18, sign * (half + 0.09) + 0.08, belt + 0.17
+        )
         body.box("tyre", 0.1, sign * half * 0.97 - 0.03, 0.2, length - 0.1, sign * half * 0.97 + 0.03, 0.34)
-    body.loft(paint, np.array([[(x, y * high, z1 + 0.05 * (1 - y * y) + 0.01) for y in np.linspace(-1, 1, 7)] for x in np.linspace(r0 - 0.03, r1 + 0.03, 5)]), lids=False)
+    body.loft(
+        paint,
+        np.array(
+            [
+                [(x, y * high, z1 + 0.05 * (1 - y * y) + 0.01) for y in np.linspace(-1, 1, 7)]
+                for x in np.linspace(r0 - 0.03, r1 + 0.03, 5)
+            ]
+        ),
+        lids=False,
+    )
     for x in (0.19 * length, 0.81 * length):
         for sign in (-1, 1):
             inner, outer = sign * (half - 0.24), sign * (half + 0.01)
@@ -111,7 +158,15 @@ def car(shapes: Shapes, rng: np.random.Generator, kind: str | None = None) -> No
             body.tube("tyre", (x, inner, 0.32), (x, outer, 0.32), (0.32, 0.31), 18)
             body.tube("chrome", (x, inner, 0.32), (x, outer + sign * 0.01, 0.32), (0.2, 0.17), 10)
     for sign in (-1, 1):
-        body.box("headlamp", length - 0.14, sign * half * 0.62 - 0.17, nose - 0.3, length + 0.0, sign * half * 0.62 + 0.17, nose - 0.15)
+        body.box(
+            "headlamp",
+            length - 0.14,
+            sign * half * 0.62 - 0.17,
+            nose - 0.3,
+            length + 0.0,
+            sign * half * 0.62 + 0.17,
+            nose - 0.15,
+        )
         body.box("taillamp", -0.01, sign * half * 0.7 - 0.12, belt - 0.36, 0.08, sign * half * 0.7 + 0.12, belt - 0.15)
     for x, z in ((-0.02, 0.55), (length - 0.03, 0.38)):
         body.box("plate_white", x, -0.26, z, x + 0.05, 0.26, z + 0.12)
@@ -181,12 +236,21 @@ def billboard(shapes: Shapes, rng: np.random.Generator) -> None:
                 low, high = np.array([np.cos(a), np.sin(a)]) * 0.62, np.array([np.cos(b), np.sin(b)]) * 0.62
                 u0, v0, u1, v1 = cell(number + 3)
                 part = np.array([1 - u, 1 - u - 0.2]) * (u1 - u0) + u0
-                shapes.pictures("posters", [[[*high, 0.3], [*low, 0.3], [*low, 2.9], [*high, 2.9]]], np.array([part[1], v0, part[0], v1]))
+                shapes.pictures(
+                    "posters", [[[*high, 0.3], [*low, 0.3], [*low, 2.9], [*high, 2.9]]], np.array([part[1], v0, part[0], v1])
+                )
         shapes.tube("green", (0, 0, 2.9), (0, 0, 3.5), (0.75, 0.1), 20)
         return
     shapes.box("iron", -0.08, -0.95, 0.0, 0.08, 0.95, 2.5)
     for sign, side in ((-1, 1), (1, -1)):
-        corners = [[[sign * 0.09, -0.85 * side, 0.4], [sign * 0.09, 0.85 * side, 0.4], [sign * 0.09, 0.85 * side, 2.4], [sign * 0.09, -0.85 * side, 2.4]]]
+        corners = [
+            [
+                [sign * 0.09, -0.85 * side, 0.4],
+                [sign * 0.09, 0.85 * side, 0.4],
+                [sign * 0.09, 0.85 * side, 2.4],
+                [sign * 0.09, -0.85 * side, 2.4],
+            ]
+        ]
         shapes.pictures("posters", corners, cell(rng.integers(16)))
 
 
@@ -214,8 +278,12 @@ def shelter(shapes: Shapes, rng: np.random.Generator) -> None:
         shapes.box("iron", x - 0.04, -0.6, 0, x + 0.04, -0.52, 2.4)
     shapes.box("zinc", -1.9, -0.7, 2.4, 1.9, 0.8, 2.5)
     shapes.box("carglass", -1.66, -0.57, 0.3, 0.53, -0.55, 2.2)
-    shapes.pictures("posters", [[[0.6, -0.5, 0.4], [1.66, -0.5, 0.4], [1.66, -0.5, 2.2], [0.6, -0.5, 2.2]]], cell(rng.integers(16)))
-    shapes.pictures("posters", [[[-1.74, 0.6, 0.4], [-1.74, -0.5, 0.4], [-1.74, -0.5, 2.2], [-1.74, 0.6, 2.2]]], cell(rng.integers(16)))
+    shapes.pictures(
+        "posters", [[[0.6, -0.5, 0.4], [1.66, -0.5, 0.4], [1.66, -0.5, 2.2], [0.6, -0.5, 2.2]]], cell(rng.integers(16))
+    )
+    shapes.pictures(
+        "posters", [[[-1.74, 0.6, 0.4], [-1.74, -0.5, 0.4], [-1.74, -0.5, 2.2], [-1.74, 0.6, 2.2]]], cell(rng.integers(16))
+    )
     bench(shapes.at(-0.4, -0.35), rng)
 
 
@@ -223,6 +291,8 @@ def fence(shapes: Shapes, rng: np.random.Generator, length: float) -> None:
     """Pickets along x from the origin."""
     x = np.arange(0, length, 0.16)
     material = str(rng.choice(["planks0", "planks1", "frame0"]))
-    shapes.boxes(material, np.stack([x, 0 * x, 0 * x + 0.05], -1), np.stack([x + 0.1, 0 * x + 0.03, 1.0 + 0.08 * np.sin(x * 9)], -1))
+    shapes.boxes(
+        material, np.stack([x, 0 * x, 0 * x + 0.05], -1), np.stack([x + 0.1, 0 * x + 0.03, 1.0 + 0.08 * np.sin(x * 9)], -1)
+    )
     for z in (0.3, 0.8):
         shapes.box(material, 0, 0.03, z, length, 0.06, z + 0.08)

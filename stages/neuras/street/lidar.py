@@ -51,7 +51,9 @@ def _beams(config: StreetConfig, rng: np.random.Generator) -> np.ndarray:
     return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1).reshape(-1, 3)
 
 
-def sweep(config: StreetConfig, city: City, caster: Caster, id: str, sensor: np.ndarray, rng: np.random.Generator) -> PointsRecord:
+def sweep(
+    config: StreetConfig, city: City, caster: Caster, id: str, sensor: np.ndarray, rng: np.random.Generator
+) -> PointsRecord:
     """One turn from ``sensor`` (3,)."""
     beams = _beams(config, rng)
     face, _, distance = caster.cast(np.broadcast_to(sensor, beams.shape), beams)

@@ -1,6 +1,7 @@
 """Frames of a city: path traced by Mitsuba, denoised, exposed and encoded.
 
-A frame's samples are seeded by its id and drawn on one thread, so its bytes depend neither on order nor on the number of workers.
+A frame's samples are seeded by its id and drawn on one thread, so its bytes depend neither on order nor on the number of
+workers.
 """
 
 from __future__ import annotations
@@ -114,7 +115,13 @@ def _shape(mi: Any, group: Group) -> Any:
     if group.kind == "matt":
         surface: dict[str, Any] = {"type": "diffuse", "reflectance": texture}
     elif group.kind == "gloss":
-        surface = {"type": "roughplastic", "diffuse_reflectance": texture, "int_ior": INDEX, "alpha": group.roughness, "nonlinear": False}
+        surface = {
+            "type": "roughplastic",
+            "diffuse_reflectance": texture,
+            "int_ior": INDEX,
+            "alpha": group.roughness,
+            "nonlinear": False,
+        }
     else:
         surface = {"type": "roughconductor", "alpha": group.roughness, "specular_reflectance": texture, "material": "none"}
     properties = mi.Properties()

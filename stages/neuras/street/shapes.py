@@ -79,7 +79,9 @@ class Shapes:
         Corners start at the viewer's lower right and go clockwise, as x runs to the left of who looks at a facade.
         """
         u0, v0, u1, v1 = np.asarray(cells, float).reshape(-1, 4).T
-        self.quads(material, corners, np.stack([np.stack(pair, -1) for pair in ((u1, v1), (u0, v1), (u0, v0), (u1, v0))], axis=1))
+        self.quads(
+            material, corners, np.stack([np.stack(pair, -1) for pair in ((u1, v1), (u0, v1), (u0, v0), (u1, v0))], axis=1)
+        )
 
     def boxes(self, material: str, low: np.ndarray, high: np.ndarray, metres: float = 1.0) -> None:
         """Boxes from ``low`` (N, 3) to ``high`` (N, 3); the texture repeats every ``metres``."""
@@ -92,7 +94,9 @@ class Shapes:
     def box(self, material: str, x0: float, y0: float, z0: float, x1: float, y1: float, z1: float, metres: float = 1.0) -> None:
         self.boxes(material, [[x0, y0, z0]], [[x1, y1, z1]], metres)
 
-    def floor(self, material: str, x0: float, y0: float, x1: float, y1: float, z: float, metres: float, step: float = 4.0) -> None:
+    def floor(
+        self, material: str, x0: float, y0: float, x1: float, y1: float, z: float, metres: float, step: float = 4.0
+    ) -> None:
         """A level rectangle, in squares of about ``step``."""
         xs = np.linspace(x0, x1, max(1, int(np.ceil((x1 - x0) / step))) + 1)
         ys = np.linspace(y0, y1, max(1, int(np.ceil((y1 - y0) / step))) + 1)
@@ -108,7 +112,9 @@ class Shapes:
         flat = np.stack([np.stack(pair, -1) for pair in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], axis=1)
         self.quads(material, corners, flat / metres * [1, flip])
 
-    def tube(self, material: str, start: np.ndarray, end: np.ndarray, radii: tuple[float, float], sides: int = 8, metres: float = 1.0) -> None:
+    def tube(
+        self, material: str, start: np.ndarray, end: np.ndarray, radii: tuple[float, float], sides: int = 8, metres: float = 1.0
+    ) -> None:
         """A cone's trunk from ``start`` to ``end`` with a lid at its end."""
         start, end = np.asarray(start, float), np.asarray(end, float)
         axis = (end - start) / np.linalg.norm(end - start)
@@ -120,7 +126,13 @@ class Shapes:
         corners = np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
         u = angle * max(radii) / metres
         v = np.array([0, -np.linalg.norm(end - start) / metres])
-        uvs = np.stack([np.stack(np.broadcast_arrays(a, b), -1) for a, b in ((u[:-1], v[0]), (u[1:], v[0]), (u[1:], v[1]), (u[:-1], v[1]))], axis=1)
+        uvs = np.stack(
+            [
+                np.stack(np.broadcast_arrays(a, b), -1)
+                for a, b in ((u[:-1], v[0]), (u[1:], v[0]), (u[1:], v[1]), (u[:-1], v[1]))
+            ],
+            axis=1,
+        )
         self.quads(material, corners, uvs)
         lid = np.concatenate([high[:-1], end[None]])
         fan = np.stack([np.arange(sides), (np.arange(sides) + 1) % sides, np.full(sides, sides)], axis=1)
@@ -140,7 +152,9 @@ class Shapes:
                 fan = np.stack([np.arange(k), (np.arange(k) + 1) % k, np.full(k, k)], axis=1)
                 self.mesh(material, points, fan, points[:, [1, 2]] / metres)
 
-    def cards(self, material: str, centres: np.ndarray, normals: np.ndarray, sizes: np.ndarray, spin: np.ndarray, spots: np.ndarray) -> None:
+    def cards(
+        self, material: str, centres: np.ndarray, normals: np.ndarray, sizes: np.ndarray, spin: np.ndarray, spots: np.ndarray
+    ) -> None:
         """Leaves: kites about ``centres`` (N, 3), each showing one spot (N, 2) of the texture."""
         axis = np.cross(normals, np.stack([np.cos(spin), np.sin(spin), np.zeros_like(spin)], -1))
         axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)

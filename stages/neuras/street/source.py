@@ -59,7 +59,11 @@ class StreetSource:
         places = np.array([pose.camera.position for pose in self._poses.values() if pose.split == "train"])
         centre = 0.5 * (places.min(axis=0) + places.max(axis=0))
         radius = 0.5 * float(np.linalg.norm(np.ptp(places, axis=0))) + (60.0 if config.preset == "street" else 30.0)
-        rule = "every other frame of the drive is held out" if config.preset == "street" else "a random half of the frames is held out"
+        rule = (
+            "every other frame of the drive is held out"
+            if config.preset == "street"
+            else "a random half of the frames is held out"
+        )
         return CaptureInfo(
             units="metre",
             metre=1.0,

@@ -13,13 +13,45 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 CELLS = 4  # pictures along each side of an atlas
-WORDS = (
-    "CAFE LUNA|BAKERY|BOOKS|HOTEL|PIZZA|FLOWERS|OPTIK|MARKET|SALON|BANK|TAILOR|RAMEN|CINEMA|RECORDS|PHARMACY|TOYS|"
-    "BIKES|DELI|SHOES|BAR 21|FRUIT|NOODLES|LAUNDRY|TRAVEL|GALLERY|WINE|KEYS|TEA ROOM|GYM|MUSIC|SUSHI|VINTAGE"
-).split("|")
+WORDS = [
+    "CAFE LUNA",
+    "BAKERY",
+    "BOOKS",
+    "HOTEL",
+    "PIZZA",
+    "FLOWERS",
+    "OPTIK",
+    "MARKET",
+    "SALON",
+    "BANK",
+    "TAILOR",
+    "RAMEN",
+    "CINEMA",
+    "RECORDS",
+    "PHARMACY",
+    "TOYS",
+    "BIKES",
+    "DELI",
+    "SHOES",
+    "BAR 21",
+    "FRUIT",
+    "NOODLES",
+    "LAUNDRY",
+    "TRAVEL",
+    "GALLERY",
+    "WINE",
+    "KEYS",
+    "TEA ROOM",
+    "GYM",
+    "MUSIC",
+    "SUSHI",
+    "VINTAGE",
+]
 
 
-def fractal(rng: np.random.Generator, size: int, low: float, high: float, slope: float = 1.0, stretch: float = 1.0) -> np.ndarray:
+def fractal(
+    rng: np.random.Generator, size: int, low: float, high: float, slope: float = 1.0, stretch: float = 1.0
+) -> np.ndarray:
     """(S, S) float32 noise that tiles, of mean 0 and deviation 1.
 
     Its frequencies are ``low`` to ``high`` cycles per tile and fall off with ``slope``; ``stretch`` over 1 draws it out
@@ -33,7 +65,9 @@ def fractal(rng: np.random.Generator, size: int, low: float, high: float, slope:
     return (out / max(out.std(), 1e-12)).astype(np.float32)
 
 
-def hue(rng: np.random.Generator, hues: tuple[float, float], saturation: tuple[float, float], value: tuple[float, float]) -> np.ndarray:
+def hue(
+    rng: np.random.Generator, hues: tuple[float, float], saturation: tuple[float, float], value: tuple[float, float]
+) -> np.ndarray:
     """(3,) an sRGB colour, drawn from ranges of hue, saturation and value."""
     return np.array(colorsys.hsv_to_rgb(rng.uniform(*hues) % 1, rng.uniform(*saturation), rng.uniform(*value)))
 
@@ -52,8 +86,13 @@ def _weathered(rng: np.random.Generator, colours: np.ndarray, stains: float = 1.
     return finished(colours * shade[..., None])
 
 
-def _courses(rng: np.random.Generator, size: int, rows: int, columns: int, joint: float, stagger: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
-    """Blocks laid in courses: (S, S) a random number per block, and where the joints are. ``joint``: share of a course's height."""
+def _courses(
+    rng: np.random.Generator, size: int, rows: int, columns: int, joint: float, stagger: float = 0.5
+) -> tuple[np.ndarray, np.ndarray]:
+    """Blocks laid in courses: (S, S) a random number per block, and where the joints are.
+
+    ``joint``: share of a course's height.
+    """
     v, u = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size, indexing="ij")
     row = np.floor(v * rows).astype(int)
     along = u * columns + stagger * (row % 2)
@@ -75,7 +114,15 @@ def brick(rng: np.random.Generator, size: int) -> np.ndarray:
 
 def plaster(rng: np.random.Generator, size: int) -> np.ndarray:
     kind = rng.random()  # mostly ochre, cream and rose; some yellow, pale blue, pale green
-    hues, most = ((0.0, 0.11), 0.4) if kind < 0.6 else ((0.11, 0.16), 0.5) if kind < 0.78 else ((0.53, 0.62), 0.28) if kind < 0.9 else ((0.25, 0.42), 0.2)
+    hues, most = (
+        ((0.0, 0.11), 0.4)
+        if kind < 0.6
+        else ((0.11, 0.16), 0.5)
+        if kind < 0.78
+        else ((0.53, 0.62), 0.28)
+        if kind < 0.9
+        else ((0.25, 0.42), 0.2)
+    )
     base = hue(rng, hues, (0.06, most), (0.68, 0.97))
     chips = fractal(rng, size, 3, 90, 1.0) > 2.2
     under = _courses(rng, size, 64, 22, 0.16)[0][..., None] * 0.3 + 0.35
@@ -110,7 +157,11 @@ def siding(rng: np.random.Generator, size: int) -> np.ndarray:
 
 def tiles(rng: np.random.Generator, size: int) -> np.ndarray:
     """Roof tiles."""
-    base = hue(rng, (0.0, 0.08), (0.2, 0.6), (0.3, 0.6)) if rng.random() < 0.7 else hue(rng, (0.55, 0.65), (0.05, 0.2), (0.25, 0.4))
+    base = (
+        hue(rng, (0.0, 0.08), (0.2, 0.6), (0.3, 0.6))
+        if rng.random() < 0.7
+        else hue(rng, (0.55, 0.65), (0.05, 0.2), (0.25, 0.4))
+    )
     block, joints = _courses(rng, size, 32, 40, 0.12)
     v = ((np.arange(size) + 0.5) / size * 32) % 1
     colours = base * ((0.6 + 0.7 * block) * (0.7 + 0.5 * v)[:, None])[..., None]
@@ -180,7 +231,12 @@ def shutter(rng: np.random.Generator, size: int) -> np.ndarray:
     for _ in range(12):
         points = np.cumsum(rng.normal(0, size / 14, (9, 2)), axis=0) + rng.uniform(0.15, 0.85, 2) * size
         colour = tuple(int(c * 255) for c in hue(rng, (0, 1), (0.4, 0.95), (0.3, 1)))
-        pen.line([tuple(point) for point in points], fill=colour, width=int(rng.integers(size // 100 + 2, size // 30 + 3)), joint="curve")
+        pen.line(
+            [tuple(point) for point in points],
+            fill=colour,
+            width=int(rng.integers(size // 100 + 2, size // 30 + 3)),
+            joint="curve",
+        )
     return _weathered(rng, np.asarray(paint) / 255.0)
 
 
@@ -225,7 +281,9 @@ def cell(index: np.ndarray | int) -> np.ndarray:
     return np.stack([u + rim, v + rim, u + 1 / CELLS - rim, v + 1 / CELLS - rim], axis=-1)
 
 
-def _colour(rng: np.random.Generator, hues: tuple[float, float], saturation: tuple[float, float], value: tuple[float, float]) -> tuple[int, ...]:
+def _colour(
+    rng: np.random.Generator, hues: tuple[float, float], saturation: tuple[float, float], value: tuple[float, float]
+) -> tuple[int, ...]:
     return tuple(int(channel * 255) for channel in hue(rng, hues, saturation, value))
 
 
@@ -256,7 +314,11 @@ def draw_window(rng: np.random.Generator, picture: Image.Image) -> None:
     for _ in range(int(rng.integers(0, 4))):  # plants on the sill
         x, h = rng.uniform(0.1, 0.9) * s, rng.uniform(0.1, 0.3) * s
         for _ in range(9):
-            pen.line((x, s, x + rng.normal(0, 0.07 * s), s - h * rng.uniform(0.5, 1)), fill=_colour(rng, (0.2, 0.38), (0.4, 0.8), (0.25, 0.6)), width=max(1, s // 50))
+            pen.line(
+                (x, s, x + rng.normal(0, 0.07 * s), s - h * rng.uniform(0.5, 1)),
+                fill=_colour(rng, (0.2, 0.38), (0.4, 0.8), (0.25, 0.6)),
+                width=max(1, s // 50),
+            )
 
 
 def draw_shop(rng: np.random.Generator, picture: Image.Image) -> None:
@@ -307,7 +369,9 @@ def draw_poster(rng: np.random.Generator, picture: Image.Image) -> None:
         shape((x, y, x + w, y + h), fill=_colour(rng, (0, 1), (0.2, 1), (0.2, 1)))
     for size, top in ((s // 5, 0.08), (s // 9, 0.42), (s // 14, 0.62), (s // 14, 0.72), (s // 14, 0.82)):
         word = " ".join(WORDS[rng.integers(len(WORDS))] for _ in range(2))
-        pen.text((s * 0.06, s * top), word, fill=_colour(rng, (0, 1), (0, 0.3), (0.02, 1)), font=ImageFont.load_default(size=size))
+        pen.text(
+            (s * 0.06, s * top), word, fill=_colour(rng, (0, 1), (0, 0.3), (0.02, 1)), font=ImageFont.load_default(size=size)
+        )
     pen.rectangle((0, 0, s - 1, s - 1), outline=(238, 236, 228), width=max(2, s // 40))
 
 
@@ -321,7 +385,9 @@ def draw_tower(rng: np.random.Generator, picture: Image.Image) -> None:
     for row in range(rows):
         for column in range(columns):
             x, y = column * s / columns, row * s / rows
-            pen.rectangle((x, y, x + wide * s / columns, y + high * s / rows), fill=_colour(rng, (0.5, 0.62), (0.1, 0.5), (0.2, 0.75)))
+            pen.rectangle(
+                (x, y, x + wide * s / columns, y + high * s / rows), fill=_colour(rng, (0.5, 0.62), (0.1, 0.5), (0.2, 0.75))
+            )
 
 
 def draw_plate(rng: np.random.Generator, picture: Image.Image) -> None:
@@ -332,4 +398,9 @@ def draw_plate(rng: np.random.Generator, picture: Image.Image) -> None:
     pen.rectangle((0, 0, s, s), fill=colour)
     pen.rectangle((s * 0.06, s * 0.06, s * 0.94, s * 0.94), outline=(245, 245, 245), width=s // 24)
     pen.ellipse((s * 0.18, s * 0.18, s * 0.82, s * 0.82), fill=(245, 245, 245))
-    pen.text((s * 0.24, s * 0.3), ("30", "50", "P", "ONE")[rng.integers(4)], fill=(20, 20, 20), font=ImageFont.load_default(size=s // 3))
+    pen.text(
+        (s * 0.24, s * 0.3),
+        ("30", "50", "P", "ONE")[rng.integers(4)],
+        fill=(20, 20, 20),
+        font=ImageFont.load_default(size=s // 3),
+    )
