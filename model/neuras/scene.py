@@ -37,7 +37,7 @@ class FitConfig:
     patch: int = 8  # pixels along a patch
     patches: int = 128  # of a step
     lr: float = 0.01  # of textures and codes
-    network_lr: float = 0.003
+    network_lr: float = 0.01
     final_lr: float = 0.1  # share of both that the cosine ends at
     codes: int = 1024  # of each codebook; 0: no quantization
     quantize_from: float = 0.0  # share of the steps before quantization begins

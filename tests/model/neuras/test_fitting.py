@@ -219,6 +219,7 @@ CONFIG = FitConfig(
     validate_every=40,
     log_every=10,
 )  # fmt: skip
+LONG = dataclasses.replace(CONFIG, steps=300, network_lr=0.01)  # enough to learn what depends on the view
 
 
 def run(folder, config=CONFIG, views=None):
@@ -235,19 +236,19 @@ def psnr(baked: Baked, seen: View) -> float:
 
 
 def test_a_scene_is_learned_far_better_than_its_mean_colour(tmp_path):
-    baked, summary, shown = run(tmp_path)
+    baked, summary, shown = run(tmp_path, LONG)
     seen = view(0.07)
     mean = -10 * np.log10(np.square(seen.rgb / 255 - seen.rgb.mean(axis=(0, 1)) / 255).mean())
     assert psnr(baked, seen) > mean + 10
     assert summary["psnr"] == pytest.approx((psnr(baked, seen) + psnr(baked, view(1.0))) / 2, abs=0.01)
-    assert shown == [80, 120]
+    assert shown == [*range(40, 300, 40), 300]
 
 
 def test_the_view_direction_explains_the_highlight(tmp_path):
-    blind = dataclasses.replace(CONFIG, shader=shading.ShaderConfig(view_direction=False))
-    with_direction, without = (run(tmp_path / name, config)[0] for name, config in (("a", CONFIG), ("b", blind)))
+    blind = dataclasses.replace(LONG, shader=shading.ShaderConfig(view_direction=False))
+    with_direction, without = (run(tmp_path / name, config)[0] for name, config in (("a", LONG), ("b", blind)))
     assert with_direction.view_dependent and not without.view_dependent
-    assert psnr(with_direction, view(0.07)) > psnr(without, view(0.07)) + 1
+    assert psnr(with_direction, view(0.07)) > psnr(without, view(0.07)) + 5
 
 
 class Killed(Exception):

@@ -1,0 +1,150 @@
+"""Stage fit on a capture of a painted ball under a sky."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+from pydantic import ValidationError
+
+from model.neuras.baked import Baked
+from pipeline.errors import UserError
+from pipeline.store.draft import Draft
+from stages.graphics.arrays import pack_json
+from stages.graphics.cameras import Camera
+from stages.neuras.rasterizing.casting import Caster
+from stages.neuras.records import FRAME, CaptureInfo, FrameRecord, save
+from stages.neuras.s03_fit import Fit, FitStageConfig
+from tests.neuras import scenes
+
+CONFIG = FitStageConfig(
+    steps=40, patch=4, patches=64, codes=64, sky_side=16, network_lr=0.01, sky_near_m=20, sky_far_m=80, skyboxes=3,
+    checkpoint_every=15, log_every=10, pictures=1, block=2,
+)  # fmt: skip
+
+
+def frame(number: int, split: str, flat) -> FrameRecord:
+    """From 6 units away, around the ball: colours are those of places on it, and of directions beside it."""
+    angle = number / 4
+    back = np.array([np.cos(angle), np.sin(angle), 0.3]) / np.sqrt(1.09)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    pose[:3, 3] = 6 * back
+    camera = Camera.from_fov(40, 32, 60, pose)
+    seen = Caster(flat.vertices, flat.faces).view(camera)
+    places = seen.interpolate(flat.faces, flat.vertices)
+    colours = np.where(seen.hit[..., None], 0.5 + 0.4 * np.sin(2 * places), 0.5 + 0.3 * camera.directions())
+    buffer = io.BytesIO()
+    Image.fromarray(np.round(255 * colours).astype(np.uint8)).save(buffer, "png")
+    return FrameRecord(f"{FRAME}{number:03d}", camera, buffer.getvalue(), split)
+
+
+class Folder:
+    """An artifact of records and files, as stages read it."""
+
+    def __init__(self, path, records=()):
+        self.path, self.records = path, {record.id: record for record in records}
+        (path / "files").mkdir(parents=True)
+
+    def rows(self):
+        return [SimpleNamespace(id=id) for id in sorted(self.records)]
+
+    def read(self, id):
+        return self.records[id]
+
+    def file(self, name):
+        return self.path / "files" / name
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    root, flat = tmp_path_factory.mktemp("inputs"), scenes.atlas()
+    records = [frame(i, "test" if i == 5 else "validation" if i == 9 else "train", flat).to_record() for i in range(12)]
+    capture, atlas = Folder(root / "capture", records), Folder(root / "atlas")
+    info = CaptureInfo("metre", 1.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 8.0, "none", "by hand")
+    capture.file("capture.json").write_bytes(pack_json(info.to_json()))
+    save(atlas.file("atlas.npz"), flat)
+    return {"capture": capture, "atlas": atlas}
+
+
+def draft(path) -> Draft:
+    return Draft(path, "fit", "0" * 64, {}, out=lambda text: None)
+
+
+def run(path, inputs, config=CONFIG):
+    made = draft(path)
+    products = Fit().run(config, inputs, made)
+    return made, {name: (made.files / name).read_bytes() for name in products}
+
+
+def test_files_of_a_fit(tmp_path, inputs):
+    made, products = run(tmp_path, inputs)
+    assert sorted(products) == ["model.json", "model.safetensors"]
+    baked = Baked.load(made.files)
+    flat = scenes.atlas()
+    assert baked.mesh_size == (flat.height, flat.width) and baked.sky_size == (3, 16)
+    assert (baked.sky_half_sizes[0] >= 20).all() and (baked.sky_half_sizes[-1] >= 80).all()
+    assert made.summary["fitting"]["psnr"] > 24
+    curve = (made.files / "curve.csv").read_text().splitlines()
+    assert curve[0].startswith("step,") and len(curve) == 1 + 4 + 1  # four intervals and the validation
+    picture = Image.open(made.files / "validation" / "step-0000040.png")
+    assert picture.size == (40, 64)
+    assert (made.files / "curve.png").exists() and any((made.files / "tensorboard").iterdir())
+    assert "seconds" not in json.dumps(json.loads(products["model.json"]))
+
+
+def test_the_unseen_frame_is_rendered_well(tmp_path, inputs):
+    baked, flat, unseen = Baked.load(run(tmp_path, inputs)[0].files), scenes.atlas(), frame(5, "test", scenes.atlas())
+    seen = Caster(flat.vertices, flat.faces).view(unseen.camera)
+    uv, directions = seen.interpolate(flat.faces, flat.uvs).reshape(-1, 2), unseen.camera.directions().reshape(-1, 3)
+    rgb, _ = baked.render(uv, seen.hit.ravel(), unseen.camera.position, directions)
+    truth = unseen.image() / 255
+    assert -10 * np.log10(np.square(rgb.reshape(truth.shape) - truth).mean()) > 24
+    assert -10 * np.log10(np.square(truth.mean(axis=(0, 1)) - truth).mean()) < 15
+
+
+def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path, inputs, monkeypatch):
+    from model.neuras import fitting
+
+    whole = run(tmp_path / "whole", inputs)[1]
+    step = fitting.Trainer.train_step
+
+    def until_20(self, batch):
+        if self.step == 20:
+            raise KeyboardInterrupt
+        step(self, batch)
+
+    monkeypatch.setattr(fitting.Trainer, "train_step", until_20)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "cut", inputs)
+    monkeypatch.setattr(fitting.Trainer, "train_step", step)
+    assert run(tmp_path / "cut", inputs)[1] == whole
+
+
+def test_without_training_frames_it_says_so(tmp_path, inputs):
+    only_tests = Folder(tmp_path / "capture", [inputs["capture"].records[f"{FRAME}005"]])
+    only_tests.file("capture.json").write_bytes(inputs["capture"].file("capture.json").read_bytes())
+    with pytest.raises(UserError, match="no training frame"):
+        run(tmp_path / "out", {**inputs, "capture": only_tests})
+
+
+@pytest.mark.parametrize(("values", "words"), [({"layers": 1}, "layers=1"), ({"sky_far_m": 10}, "sky_far_m=10")])
+def test_settings_that_cannot_be_are_refused(values, words):
+    with pytest.raises(ValidationError, match=words):
+        FitStageConfig(**values)
+
+
+def test_every_setting_reaches_the_loop():
+    """A field of the loop that the stage forgot would silently keep its default."""
+    from model.neuras.scene import FitConfig, ShaderConfig
+
+    names = {field.name for kind in (FitConfig, ShaderConfig) for field in dataclasses.fields(kind)}
+    assert names - set(FitStageConfig.model_fields) == {"shader", "voxel"}
+    assert FitStageConfig(voxel_m=0.5).fit(metre=2.0).voxel == 1.0
