@@ -1,0 +1,75 @@
+"""The whole line on a very small street, through the command line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.store import Store
+from stages.neuras.records import CaptureInfo, frames, load_atlas
+from stages.neuras.s01_scaffold import scaffold_mesh
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = [
+    "system=neuras", "capture.length=90", "capture.texture_size=64", "capture.training_frames=3", "capture.width=96",
+    "capture.height=54", "capture.spp=1", "capture.shifts=[2.0]", "capture.shift_frames=1", "capture.columns=90",
+    "capture.beams=32", "scaffold.voxel_m=0.2", "scaffold.depth=8", "scaffold.faces=4000", "scaffold.speck_faces=4",
+    "scaffold.cull_rays=1", "atlas.tile_faces=1500", "fit.steps=30", "fit.sky_side=32", "fit.codes=64",
+    "fit.checkpoint_every=10", "workers=2",
+]  # fmt: skip
+
+
+def run(store: Path, *words: str) -> str:
+    command = [sys.executable, "-m", "pipeline", *SMALL, f"store={store}", *words]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def line(tmp_path_factory):
+    store = tmp_path_factory.mktemp("neuras")
+    return store, run(store, "stage=bake")
+
+
+def artifact(store: Path, stage: str):
+    (found,) = Store(store).artifacts(f"neuras/{stage}")
+    return found
+
+
+def test_from_nothing_to_a_page(line):
+    store, output = line
+    assert "site/index.html" in output.splitlines()[-1]
+    capture = artifact(store, "capture")
+    views = list(frames(capture))
+    assert {view.split for view in views} == {"train", "validation", "test", "shift"} or len(views) >= 5
+    assert CaptureInfo.of(capture).units == "metre"
+    mesh, atlas = scaffold_mesh(artifact(store, "scaffold")), load_atlas(artifact(store, "atlas").file("atlas.npz"))
+    assert 500 < len(mesh.faces) <= 4100 and len(atlas.faces) == len(mesh.faces)
+    site = artifact(store, "bake").path / "files" / "site"
+    assert {"index.html", "viewer.js", "scene.json", "geometry.glb", "mesh_codes.png"} <= {path.name for path in site.iterdir()}
+
+
+def test_a_second_run_computes_nothing(line):
+    store, _ = line
+    assert run(store, "stage=bake").count("up to date") == 5
+
+
+def test_other_steps_fit_anew_and_render_no_street(line):
+    store, _ = line
+    output = run(store, "stage=bake", "fit.steps=31")
+    assert output.count("up to date") == 3
+    fits = Store(store).artifacts("neuras/fit")
+    assert len({fit.digest for fit in fits}) == 2
+
+
+def test_the_same_line_elsewhere_has_the_same_bytes_with_other_workers(line, tmp_path):
+    store, _ = line
+    run(tmp_path, "stage=bake", "workers=0")
+    for stage in ("capture", "scaffold", "atlas", "fit", "bake"):
+        others = {other.key: other.digest for other in Store(store).artifacts(f"neuras/{stage}")}
+        again = artifact(tmp_path, stage)
+        assert again.digest == others[again.key], stage
