@@ -20,6 +20,7 @@ from stages.neuras.evaluation import paths
 from stages.neuras.evaluation.renderers import Reference, Scene, as_bytes
 from stages.neuras.records import frames
 
+OTHER = (".avi", ".gif", ".mkv", ".mov", ".webm", ".png", ".jpg", ".jpeg")  # a file of a kind that is not written
 RendererName = Literal["auto", "opengl", "torch"]
 
 
@@ -50,7 +51,7 @@ class Trip:
 def scene_of(store: Store, reference: str) -> tuple[Scene, Artifact]:
     """The scene and the capture behind an artifact of stage bake (or of a later stage)."""
     artifact = store.resolve(reference)
-    if artifact.system != "neuras" or artifact.stage not in ("bake", "evaluate"):
+    if artifact.stage not in ("bake", "evaluate") or "atlas" not in artifact.manifest["preimage"]["inputs"]:
         raise UserError(f"{artifact.name} is no baked scene: give one of stage bake (`lightmill ls neuras/bake` lists them)")
     inputs = {}
     for role in ("capture", "atlas", "fit"):
@@ -85,7 +86,7 @@ def write(out: Path, images: Iterable[np.ndarray], fps: int) -> int:
     """
     if out.suffix == ".mp4":
         return write_video(out, (image[: len(image) // 2 * 2, : image.shape[1] // 2 * 2] for image in images), fps)
-    if out.suffix:
+    if out.suffix.lower() in OTHER:
         raise UserError(f"{out}: the output is FILE.mp4, or a folder for PNGs")
     count = 0
     for image in images:

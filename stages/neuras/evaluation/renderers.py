@@ -15,7 +15,7 @@ from model.neuras.baked import Baked
 from pipeline.errors import UserError
 from pipeline.store import Artifact
 from stages.graphics.cameras import Camera
-from stages.neuras.baking.drawing import Drawing, TextureFormat, context, depth_range
+from stages.neuras.baking import drawing
 from stages.neuras.rasterizing.casting import Caster, GBuffer
 from stages.neuras.records import AtlasMesh, CaptureInfo, load_atlas
 
@@ -61,15 +61,16 @@ class Scene:
     def reference(self) -> Reference:
         return Reference(self.baked, self.atlas)
 
-    def drawing(self, texture_format: TextureFormat = "fp16") -> Drawing:
+    def drawing(self, texture_format: drawing.TextureFormat = "fp16") -> drawing.Drawing:
         """By OpenGL; UserError where the machine has none."""
-        return Drawing(self.baked, self.atlas, *depth_range(self.atlas.vertices, self.info.metre), texture_format)
+        planes = drawing.depth_range(self.atlas.vertices, self.info.metre)
+        return drawing.Drawing(self.baked, self.atlas, *planes, texture_format)
 
 
 def opengl() -> str | None:
     """What draws by OpenGL here; None where nothing does."""
     try:
-        gl = context()
+        gl = drawing.context()
     except UserError:
         return None
     name = f"{gl.info['GL_RENDERER']}, OpenGL {gl.info['GL_VERSION']}"
