@@ -196,16 +196,19 @@ def time_table(timing: Mapping[str, Any]) -> Table | None:
     rows = []
     if "opengl" in timing:
         row = timing["opengl"]
-        size = f"{row['size'][0]} × {row['size'][1]}"
-        rows.append([f"baked shader, {size}", row["drawn_by"], f"{row['neural_fps']:.2f}", f"{row['ratio']:.2f}"])
-        rows.append([f"plain textured mesh, {size}", row["drawn_by"], f"{row['plain_fps']:.2f}", "1"])
-    if "page" in timing and timing["page"]["ms"]:
-        row = timing["page"]
-        frame = float(np.median(row["ms"]))
+        width, height = row["size"]
+        for what, fps, ratio in (
+            ("baked shader", row["neural_fps"], row["ratio"]),
+            ("plain textured mesh", row["plain_fps"], 1.0),
+        ):
+            rows.append([Cell(f"{what}, {width} × {height}", row["drawn_by"]), f"{fps:.2f}", f"{ratio:.2f}"])
+    if timing.get("page", {}).get("ms"):
+        width, height = timing["page"]["size"]
+        fps = 1000 / float(np.median(timing["page"]["ms"]))
         rows.append(
-            [f"the page, {row['size'][0]} × {row['size'][1]}", "browser, software WebGL 2", f"{1000 / frame:.2f}", None]
+            [Cell(f"the page, {width} × {height}", "a browser without a window, WebGL 2 in software"), f"{fps:.2f}", None]
         )
-    return Table(["what is drawn", "by", "frames per second", "time, plain = 1"], rows, numeric=True) if rows else None
+    return Table(["what is drawn", "frames per second", "time, plain = 1"], rows, numeric=True) if rows else None
 
 
 def byte_table(summary: Summary) -> Table:
