@@ -1,4 +1,4 @@
-"""What `lightmill` offers for NeuRas: drive.
+"""What `lightmill` offers for NeuRas: drive, scores.
 
 Heavy libraries are imported by the command that needs them, so that ``lightmill ls`` answers at once.
 """
@@ -6,6 +6,7 @@ Heavy libraries are imported by the command that needs them, so that ``lightmill
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,14 @@ def command_drive(arguments: argparse.Namespace) -> int:
     )
     for line in drive(Store(arguments.store), arguments.key, trip, Path(arguments.out), arguments.renderer):
         print(line)
+    return 0
+
+
+def command_scores(arguments: argparse.Namespace) -> int:
+    from pipeline.store import Store
+    from stages.neuras.evaluation.side_by_side import written
+
+    print(written(Store(arguments.store), arguments.keys))
     return 0
 
 
@@ -45,11 +54,15 @@ def count(text: str) -> int:
 
 def add_commands(parsers: Any, program: str) -> None:
     """Mount the commands on ``parsers`` (argparse's subparsers)."""
+
+    def add(name: str, function: Callable[[argparse.Namespace], int], summary: str, example: str) -> argparse.ArgumentParser:
+        sub = parsers.add_parser(name, help=summary, description=summary, epilog=f"example: {program} {name} {example}")
+        sub.set_defaults(function=function)
+        sub.add_argument("--store", default="store", help="the store's folder (default: store)")
+        return sub
+
     summary = "drive through a baked scene, along its capture's path, beside it, or along poses of your own"
-    sub = parsers.add_parser(
-        "drive", help=summary, description=summary, epilog=f"example: {program} drive bake --lane-shift 3 -o drive.mp4"
-    )
-    sub.set_defaults(function=command_drive)
+    sub = add("drive", command_drive, summary, "bake --lane-shift 3 -o drive.mp4")
     sub.add_argument("key", metavar="KEY", help="a bake artifact's key or name, or 'bake' for the newest")
     sub.add_argument("-o", "--out", required=True, help="FILE.mp4, or a folder for PNGs")
     sub.add_argument("--trajectory", metavar="FILE", help="JSON: a list of camera-to-world matrices, or a transforms.json")
@@ -60,4 +73,7 @@ def add_commands(parsers: Any, program: str) -> None:
     sub.add_argument(
         "--renderer", choices=("auto", "opengl", "torch"), default="auto", help="auto (default): OpenGL, or torch without it"
     )
-    sub.add_argument("--store", default="store", help="the store's folder (default: store)")
+
+    summary = "evaluations of several fits of one capture as a Markdown table, with paired differences"
+    sub = add("scores", command_scores, summary, "ours=KEY plain=KEY > table.md")
+    sub.add_argument("keys", nargs="+", metavar="KEY", help="artifacts of neuras' evaluate, or NAME=KEY; the first is compared")

@@ -246,6 +246,25 @@ def test_a_capture_that_holds_nothing_out_is_an_error(run):
         run(evaluate={**QUICK, "splits": ["validation"]})
 
 
+def test_runs_stand_side_by_side(run, capsys):
+    quick = {**QUICK, "video_frames": 0}
+    good, bad, other = (
+        run(evaluate=quick, **sections)[0]["evaluate"]
+        for sections in ({"fit": {"error": 0.0}}, {}, {"capture": {"masked": True}})
+    )
+    store = str(good.path.parents[2])
+    assert lightmill("scores", f"good={good.key}", f"bad={bad.key}", "--store", store) == 0
+    table = capsys.readouterr().out.splitlines()
+    assert "| good | bad | multi-view warping | good better than bad |" in table[0]
+    row = next(text for text in table if text.startswith("| 2 m, both sides: PSNR"))
+    means, gain = row.split("|")[2:4], row.split("|")[5]
+    assert float(gain.split()[0]) == pytest.approx(float(means[0]) - float(means[1]), abs=0.011) and float(gain.split()[0]) > 10
+    assert table[-1].startswith("| stored (MB) |")
+    for wrong, said in ((other.key, "not of the same frames"), ("ball/bake", "no evaluation")):
+        assert lightmill("scores", good.key, wrong, "--store", store) != 0
+        assert said in capsys.readouterr().err
+
+
 # -- drives
 
 
