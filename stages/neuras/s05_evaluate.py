@@ -8,14 +8,13 @@ stay out of the records and of metrics.json.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from pipeline.config import StageConfig, report, runtime
-from pipeline.errors import Reject, UserError
+from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 
 if TYPE_CHECKING:
@@ -23,14 +22,8 @@ if TYPE_CHECKING:
 
     from pipeline.store import Artifact, Draft
     from stages.graphics.cameras import Camera
-    from stages.neuras.baking.drawing import Drawing
-    from stages.neuras.evaluation.renderers import Reference, Scene
-    from stages.neuras.evaluation.scores import Scorer
-    from stages.neuras.evaluation.warping import Source, Warping
-
-LEAST = 0.01  # share of a view's pixels that its mask must leave
-LANE = 3.0  # metres to the right, of the video's lane change
-CACHED = 8  # photos that a worker keeps for warping
+    from stages.neuras.evaluation.renderers import Scene
+    from stages.neuras.evaluation.views import Examiner
 
 
 class EvaluateConfig(StageConfig):
@@ -44,18 +37,6 @@ class EvaluateConfig(StageConfig):
     timing_frames: int = report(3, ge=0)  # frames timed, 0: none
     timing_size: tuple[int, int] = report((1920, 1080))  # width and height in pixels
     page_views: int = report(6, ge=0)  # frames that a browser draws, 0: none
-
-
-@dataclass(frozen=True, eq=False)
-class Worker:
-    """What every view needs. drawings: the baked shader by texture format; empty without OpenGL."""
-
-    config: EvaluateConfig
-    capture: Artifact
-    reference: Reference
-    drawings: dict[str, Drawing]
-    warping: Warping
-    scorers: dict[str, Scorer]
 
 
 class Evaluate(MapStage):
@@ -94,68 +75,38 @@ class Evaluate(MapStage):
             )
         return (Item(row.id, row.group) for row in rows)
 
-    def open(self, config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any]) -> Worker:
+    def open(self, config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any]) -> tuple[Examiner, Artifact]:
         import torch
 
         from stages.neuras.evaluation.renderers import Scene
         from stages.neuras.evaluation.scores import scorers
+        from stages.neuras.evaluation.views import Examiner, warping
 
         torch.set_num_threads(1)  # sums in another order round differently
-        scene = Scene.of(inputs)
+        scene, capture = Scene.of(inputs), inputs["capture"]
         reference = scene.reference()
-        return Worker(
-            config,
-            inputs["capture"],
+        examiner = Examiner(
             reference,
             {} if environment["opengl"] is None else {kind: scene.drawing(kind) for kind in ("fp16", "rgba8")},
-            _warping(config, inputs["capture"], reference, scene.info.radius),
+            warping(capture, reference, scene.info.radius, config.warping_views),
             scorers(config.lpips, config.lpips_folder),
+            config.depth_tolerance,
         )
+        return examiner, capture
 
-    def process(self, worker: Worker, item: Item) -> Iterator[Record]:
-        import numpy as np
-
+    def process(self, worker: tuple[Examiner, Artifact], item: Item) -> Iterator[Record]:
         from stages.graphics.arrays import pack_json
         from stages.graphics.page import png
-        from stages.neuras.evaluation import scores
-        from stages.neuras.evaluation.renderers import as_bytes
-        from stages.neuras.evaluation.report import difference
         from stages.neuras.records import FrameRecord
 
-        frame = FrameRecord.from_record(worker.capture.read(item.id))
-        photo, counts, camera = frame.image(), frame.counts(), frame.camera
-        if counts[5:-5, 5:-5].mean() < LEAST:
-            raise Reject("masked", f"{100 * counts.mean():.1f} % of its pixels are left")
-        seen = worker.reference.caster.view(camera)
-        exact = worker.reference.shade(camera, seen)
-        warped, covered = worker.warping.render(camera)
-        drawn = {kind: drawing.render(camera) for kind, drawing in worker.drawings.items()}
-        pictures = {"ours": exact, "warping": warped, **({"shader": drawn["fp16"]} if drawn else {})}
-        pictures = {method: as_bytes(picture) for method, picture in pictures.items()}
-        errors = None
-        if frame.depth is not None:
-            tolerance = worker.config.depth_tolerance
-            errors = scores.error_places(photo, pictures["ours"], counts, seen.depth, frame.depth, tolerance)
-        facts = {
-            "id": frame.id,
-            "split": frame.split,
-            "trajectory": frame.trajectory,
-            "shift": frame.shift,
-            "size": [camera.width, camera.height],
-            "counted": round(float(counts.mean()), 6),
-            "scores": {method: scores.score(photo, picture, counts, worker.scorers) for method, picture in pictures.items()},
-            "errors": errors,
-            "agreement": {kind: scores.agreement(picture, exact) for kind, picture in drawn.items()},
-            "unseen_by_warping": round(float(1 - np.mean(covered)), 6),
-        }
-        pictures |= {"photo": photo, "difference": difference(photo, pictures["ours"], counts)}
-        members = {f"{name}.png": png(picture) for name, picture in pictures.items()}
-        yield Record(item.id, {"metrics.json": pack_json(facts), **members})
+        examiner, capture = worker
+        facts, pictures = examiner.examine(FrameRecord.from_record(capture.read(item.id)))
+        yield Record(item.id, {"metrics.json": pack_json(facts), **{f"{name}.png": png(p) for name, p in pictures.items()}})
 
     def finish(self, config: EvaluateConfig, inputs: Inputs, draft: Draft) -> None:
         from pipeline.store.files import write_json
         from stages.graphics.arrays import unpack_json
-        from stages.neuras.evaluation import costs, report
+        from stages.neuras.evaluation import costs, drive, report
         from stages.neuras.evaluation.renderers import Scene
         from stages.neuras.evaluation.summary import summarise
         from stages.neuras.records import frames
@@ -176,7 +127,7 @@ class Evaluate(MapStage):
             timing["opengl"] = {"drawn_by": drawn_by, **costs.time_shader(scene, some, config.timing_size)}
         if config.page_views:
             missing += _page(config, scene, site, cameras, summary, timing)
-        clips = _videos(config, inputs["capture"], scene, drawn_by is not None, draft.files)
+        clips = drive.videos(scene, inputs["capture"], config.video_frames, drawn_by is not None, draft.files)
         about = report.About(inputs, draft.key, config.model_dump(mode="json"), drawn_by)
         write_json(draft.files / "metrics.json", summary)
         write_json(draft.files / "timing.json", timing)
@@ -193,26 +144,6 @@ class Evaluate(MapStage):
 
     def check(self, draft: Draft) -> None:
         assert (draft.files / "report.html").is_file(), "evaluate wrote no report"
-
-
-def _warping(config: EvaluateConfig, capture: Artifact, reference: Reference, radius: float) -> Warping:
-    """Warping from the training photos, each read when it is needed."""
-    import functools
-
-    from stages.neuras.evaluation.warping import Source, Warping
-    from stages.neuras.records import FrameRecord
-
-    ids = capture.ids("train")
-    cameras = [FrameRecord.from_record(capture.read(id)).camera for id in ids]
-
-    @functools.lru_cache(CACHED)
-    def source(index: int) -> Source:
-        frame = FrameRecord.from_record(capture.read(ids[index]))
-        image = frame.image().astype("float32") / 255
-        return Source(frame.camera, image, frame.counts(), reference.caster.view(frame.camera))
-
-    read: Callable[[int], Source] = source
-    return Warping(reference.caster, cameras, read, radius, config.warping_views)
 
 
 def _page(
@@ -234,22 +165,3 @@ def _page(
     summary["page"] = page["views"]
     timing["page"] = {name: page[name] for name in ("size", "ms")}
     return []
-
-
-def _videos(config: EvaluateConfig, capture: Artifact, scene: Scene, opengl: bool, folder: Path) -> dict[str, Path]:
-    """Videos along the drive and through a lane change, by caption."""
-    from stages.neuras.evaluation import drive, paths
-    from stages.neuras.records import frames
-
-    if not config.video_frames:
-        return {}
-    along = paths.smooth(paths.driven(frames(capture)), config.video_frames)
-    over = paths.beside(along, paths.lane_change(len(along), LANE * scene.info.metre))
-    clips = {"along the drive": ("drive.mp4", along), f"a change of lane by {LANE:g} m and back": ("lane_change.mp4", over)}
-    renderer, _ = drive.open_renderer(scene, "opengl" if opengl else "torch")
-    try:
-        for name, cameras in clips.values():
-            drive.write(folder / name, drive.pictures(renderer, cameras), fps=24)
-    finally:
-        renderer.close()
-    return {caption: folder / name for caption, (name, _) in clips.items()}

@@ -21,6 +21,8 @@ from stages.neuras.evaluation.renderers import Reference, Scene, as_bytes
 from stages.neuras.records import frames
 
 OTHER = (".avi", ".gif", ".mkv", ".mov", ".webm", ".png", ".jpg", ".jpeg")  # a file of a kind that is not written
+LANE = 3.0  # metres, of a report's lane change
+WIDEST, WIDEST_SLOW = 1280, 480  # pixels of a report's videos, by OpenGL and by torch
 RendererName = Literal["auto", "opengl", "torch"]
 
 
@@ -105,3 +107,21 @@ def drive(store: Store, reference: str, trip: Trip, out: Path, renderer_name: Re
     finally:
         renderer.close()
     return [f"{count} frames of {cameras[0].width} x {cameras[0].height}, {line}", str(out)]
+
+
+def videos(scene: Scene, capture: Artifact, count: int, opengl: bool, folder: Path) -> dict[str, Path]:
+    """A video of ``count`` pictures along the drive, and one through a lane change, by caption; none where count is 0."""
+    if not count:
+        return {}
+    along = paths.smooth(paths.driven(frames(capture)), count)
+    width = min(along[0].width, WIDEST if opengl else WIDEST_SLOW)
+    along = [paths.framed(camera, width, round(width * camera.height / camera.width)) for camera in along]
+    over = paths.beside(along, paths.lane_change(count, LANE * scene.info.metre))
+    clips = {"along the drive": ("drive.mp4", along), f"{LANE:g} m over to the right, and back": ("lane_change.mp4", over)}
+    renderer, _ = open_renderer(scene, "opengl" if opengl else "torch")
+    try:
+        for name, cameras in clips.values():
+            write(folder / name, pictures(renderer, cameras), fps=24)
+    finally:
+        renderer.close()
+    return {caption: folder / name for caption, (name, _) in clips.items()}

@@ -21,9 +21,9 @@ from stages.graphics.statistics import decided
 from stages.neuras.baking.drawing import INSTALL
 from stages.neuras.evaluation.scores import PLACES, SEEN, told
 from stages.neuras.evaluation.summary import METHODS
+from stages.neuras.evaluation.views import GAIN
 from stages.neuras.records import CaptureInfo
 
-GAIN = 4  # of a difference
 SHOWN = {"photo": "photo", "ours": "ours", "warping": "warping", "difference": f"difference ×{GAIN}"}
 WIDEST = 640  # pixels of a picture in the gallery
 AGAIN = "then run again with `force=evaluate`"
@@ -74,12 +74,6 @@ def always_missing(lpips: str) -> list[str]:
 
 def no_page(error: Exception) -> str:
     return f"The page's pictures and frame times: {error}. To have them, install chromium, {AGAIN}."
-
-
-def difference(photo: np.ndarray, picture: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8: the absolute difference times ``GAIN``; black where pixels do not count."""
-    apart = np.abs(photo.astype(int) - picture) * GAIN
-    return np.where(counts[..., None], np.minimum(apart, 255), 0).astype(np.uint8)
 
 
 # --- numbers in words -------------------------------------------------------------------------------------------------
