@@ -34,9 +34,11 @@ stages.renderformer.rendering
 stages.renderformer.dataset  stages.renderformer.scenes  stages.renderformer.objects
 stages.renderformer.views
 stages.renderformer.records
-stages.neuras.s02_atlas  stages.neuras.s03_fit  stages.neuras.s04_bake
+stages.neuras.commands
+stages.neuras.s02_atlas  stages.neuras.s03_fit  stages.neuras.s04_bake  stages.neuras.s05_evaluate
 stages.neuras.s00_capture  stages.neuras.s01_scaffold
-stages.neuras.captures  stages.neuras.street  stages.neuras.surfaces  stages.neuras.evaluation  stages.neuras.baking
+stages.neuras.evaluation
+stages.neuras.captures  stages.neuras.street  stages.neuras.surfaces  stages.neuras.baking
 stages.neuras.rasterizing
 stages.neuras.records
 stages.neuras

@@ -36,21 +36,28 @@ def psnr(reference: np.ndarray, test: np.ndarray) -> float:
     return float(-10 * np.log10(max(mse, 10 ** (-PSNR_MAX / 10))))
 
 
-def ssim(reference: np.ndarray, test: np.ndarray) -> float:
-    """SSIM of values in [0, 1]: Gaussian window of sigma 1.5, data range 1, mean over pixels and channels."""
+def ssim(reference: np.ndarray, test: np.ndarray, counts: np.ndarray | None = None) -> float:
+    """SSIM of values in [0, 1]: Gaussian window of sigma 1.5, data range 1, mean over pixels and channels.
+
+    counts: (H, W) bool, the pixels that the mean is over; None: all. Pixels nearer to the border than the window's radius
+    are never in it.
+    """
     from skimage.metrics import structural_similarity
 
-    return float(
-        structural_similarity(
-            reference.astype(np.float64),
-            test.astype(np.float64),
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-            data_range=1.0,
-            channel_axis=-1,
-        )
+    mean, similarity = structural_similarity(
+        reference.astype(np.float64),
+        test.astype(np.float64),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+        full=True,
     )
+    if counts is None:
+        return float(mean)
+    inner = (slice(SSIM_MIN_SIZE // 2, -(SSIM_MIN_SIZE // 2)),) * 2
+    return float(similarity[inner][counts[inner]].mean())
 
 
 def log_error(reference: np.ndarray, test: np.ndarray) -> float:

@@ -10,7 +10,9 @@ SYSTEM = System(
         "atlas": "stages.neuras.s02_atlas:Atlas",
         "fit": "stages.neuras.s03_fit:Fit",
         "bake": "stages.neuras.s04_bake:Bake",
+        "evaluate": "stages.neuras.s05_evaluate:Evaluate",
     },
-    targets={"data": ("atlas",), "train": ("fit",), "eval": ("bake",)},
+    targets={"data": ("atlas",), "train": ("fit",), "eval": ("evaluate",)},
+    commands="stages.neuras.commands:add_commands",
     packages=("lightmill", "torch", "mitsuba", "drjit", "pymeshlab", "xatlas", "moderngl", "numpy", "scipy", "pyoidn", "hydra-core"),
 )

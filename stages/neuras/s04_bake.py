@@ -38,6 +38,7 @@ class Bake(RunStage):
     def run(self, config: BakeConfig, inputs: Inputs, draft: Draft) -> list[str]:
         from model.neuras.baked import Baked
         from stages.neuras.baking import site
+        from stages.neuras.baking.drawing import depth_range
         from stages.neuras.records import CaptureInfo, frames, load_atlas
 
         capture = inputs["capture"]
@@ -57,8 +58,3 @@ class Bake(RunStage):
         )
         draft.note("summary", {"megabytes": {kind: round(size / 1e6, 3) for kind, size in sizes.items()}})
         return sorted(path.relative_to(draft.files).as_posix() for path in draft.files.rglob("*") if path.is_file())
-
-
-def depth_range(vertices: np.ndarray, metre: float) -> tuple[float, float]:
-    """Near and far plane in world units: a tenth of a metre, and beyond the mesh from anywhere within it."""
-    return 0.1 * metre, float(2 * np.linalg.norm(np.ptp(vertices, axis=0)) + metre)

@@ -34,6 +34,11 @@ def projection(camera: Camera, near: float, far: float) -> np.ndarray:
     return np.array([[x, 0, -z, 0], [0, y, -w, 0], [0, 0, *depth], [0, 0, -1, 0]])
 
 
+def depth_range(vertices: np.ndarray, metre: float) -> tuple[float, float]:
+    """Near and far plane in world units: a tenth of a metre, and beyond the mesh from anywhere within it."""
+    return 0.1 * metre, float(2 * np.linalg.norm(np.ptp(vertices, axis=0)) + metre)
+
+
 def lens(camera: Camera) -> tuple[float, float, float, float]:
     """Focal lengths and principal point in halves of the image, y up: ndc = lens[:2] * (x, y) / -z + lens[2:]."""
     return (

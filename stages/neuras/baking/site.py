@@ -97,7 +97,7 @@ def write_site(
     for path in sorted(PAGE.iterdir()):
         if path.suffix in (".html", ".js", ".css"):
             shutil.copyfile(path, folder / path.name)
-    return _sizes(folder)
+    return sizes(folder)
 
 
 def _in_rows(maps: np.ndarray) -> np.ndarray:
@@ -146,9 +146,14 @@ def _codes(path: Path, codes: np.ndarray) -> None:
     Image.fromarray(pixels, "RGB").save(path, optimize=True)
 
 
+def view_name(frame_id: str) -> str:
+    """How the page calls the frame of that record."""
+    return frame_id.removeprefix(FRAME)
+
+
 def _view(folder: Path, frame: FrameRecord, centre: np.ndarray) -> dict[str, Any]:
     """A frame as the page knows it; its photo is written beside. World coordinates are relative to the centre."""
-    name = frame.id.removeprefix(FRAME)
+    name = view_name(frame.id)
     path = folder / "frames" / f"{name}.jpg"
     if frame.picture.startswith(b"\xff\xd8"):
         path.write_bytes(frame.picture)
@@ -170,7 +175,8 @@ def _view(folder: Path, frame: FrameRecord, centre: np.ndarray) -> dict[str, Any
     }
 
 
-def _sizes(folder: Path) -> dict[str, int]:
+def sizes(folder: Path) -> dict[str, int]:
+    """Bytes of a site's kinds of files."""
     kinds = {"geometry": 0, "textures": 0, "shaders": 0, "frames": 0, "page": 0}
     for path in folder.rglob("*"):
         if path.is_file():

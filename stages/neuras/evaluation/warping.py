@@ -6,7 +6,7 @@ their direction alone, as if infinitely far, among source pixels without a point
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,11 +30,18 @@ class Source:
 
 
 class Warping:
-    """A renderer of new views from ``sources``; ``nearest`` of them are used for each view."""
+    """A renderer of new views from photos.
 
-    def __init__(self, caster: Caster, sources: Sequence[Source], radius: float, nearest: int = 4):
+    cameras: of all sources. source: gives one by its number; photos may be many, so nobody holds them all. radius: the
+    scene's, world units. nearest: so many sources are used for a view.
+    """
+
+    def __init__(
+        self, caster: Caster, cameras: Sequence[Camera], source: Callable[[int], Source], radius: float, nearest: int = 4
+    ):
         self.caster = caster
-        self.sources = list(sources)
+        self.positions = np.array([camera.position for camera in cameras])
+        self.source = source
         self.far = radius * FAR
         self.nearest = nearest
 
@@ -49,11 +56,10 @@ class Warping:
         points = camera.position + directions * np.where(view.hit, view.depth, self.far)[..., None]
         total = np.zeros((camera.height, camera.width, 3))
         weights = np.zeros((camera.height, camera.width))
-        distances = [np.linalg.norm(source.camera.position - camera.position) for source in self.sources]
+        distances = np.linalg.norm(self.positions - camera.position, axis=1)
         for index in np.argsort(distances, kind="stable")[: self.nearest]:
-            source = self.sources[index]
-            colour, sees = look_up(source, points, view.hit)
-            weight = sees / (distances[index] + 1e-3 * max(distances))
+            colour, sees = look_up(self.source(int(index)), points, view.hit)
+            weight = sees / (distances[index] + max(1e-3 * distances.max(), 1e-9))
             total += colour * weight[..., None]
             weights += weight
         seen = weights > 0

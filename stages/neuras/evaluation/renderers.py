@@ -1,0 +1,84 @@
+"""A fitted scene, and the two renderers that draw it: torch, the reference, and the baked shader in OpenGL.
+
+Both have ``render(camera)``, which gives (H, W, 3) float32 in [0, 1].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from model.neuras.baked import Baked
+from pipeline.errors import UserError
+from pipeline.store import Artifact
+from stages.graphics.cameras import Camera
+from stages.neuras.baking import drawing
+from stages.neuras.rasterizing.casting import Caster, GBuffer
+from stages.neuras.records import AtlasMesh, CaptureInfo, load_atlas
+
+
+class Reference:
+    """The scene by torch, slow and exact (``Baked.render``). Use as a ``Drawing``."""
+
+    def __init__(self, baked: Baked, atlas: AtlasMesh):
+        self._baked, self._atlas = baked, atlas
+        self.caster = Caster(atlas.vertices, atlas.faces)
+
+    def render(self, camera: Camera) -> np.ndarray:
+        return self.shade(camera, self.caster.view(camera))
+
+    def shade(self, camera: Camera, view: GBuffer) -> np.ndarray:
+        """The picture of a camera whose view of the mesh is known."""
+        uv = view.interpolate(self._atlas.faces, self._atlas.uvs).reshape(-1, 2)
+        rays = camera.directions().reshape(-1, 3)
+        colours, _ = self._baked.render(uv, view.hit.ravel(), camera.position, rays)
+        return colours.reshape(camera.height, camera.width, 3)
+
+    def close(self) -> None:
+        pass
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is drawn: the fitted maps and networks, the mesh that they lie on, and facts of the capture."""
+
+    baked: Baked
+    atlas: AtlasMesh
+    info: CaptureInfo
+
+    @classmethod
+    def of(cls, inputs: Mapping[str, Artifact]) -> Scene:
+        """Of artifacts by role: capture, atlas, fit."""
+        return cls(
+            Baked.load(inputs["fit"].path / "files"),
+            load_atlas(inputs["atlas"].file("atlas.npz")),
+            CaptureInfo.of(inputs["capture"]),
+        )
+
+    def reference(self) -> Reference:
+        return Reference(self.baked, self.atlas)
+
+    def drawing(self, texture_format: drawing.TextureFormat = "fp16") -> drawing.Drawing:
+        """By OpenGL; UserError where the machine has none."""
+        planes = drawing.depth_range(self.atlas.vertices, self.info.metre)
+        return drawing.Drawing(self.baked, self.atlas, *planes, texture_format)
+
+
+def opengl() -> str | None:
+    """What draws by OpenGL here; None where nothing does."""
+    try:
+        gl = drawing.context()
+    except UserError:
+        return None
+    name = f"{gl.info['GL_RENDERER']}, OpenGL {gl.info['GL_VERSION']}"
+    gl.release()
+    return name
+
+
+def as_bytes(picture: np.ndarray) -> np.ndarray:
+    """A picture in [0, 1] as uint8: what a file or a screen gets."""
+    result: Any = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+    return result

@@ -1,0 +1,167 @@
+"""Stage evaluate: how well a fitted scene shows what it was not fitted to, against multi-view warping (section 4).
+
+Reads capture's held-out and shifted frames, and atlas, fit and bake. Writes one record per frame: the photo, ours by torch,
+ours by the baked shader where OpenGL is, warping, the difference, and ``metrics.json``. ``files/`` gets report.html,
+metrics.json, timing.json, and videos along the drive and through a lane change. Times are never the same twice, so they
+stay out of the records and of metrics.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from pipeline.config import StageConfig, report, runtime
+from pipeline.errors import UserError
+from pipeline.stage import Inputs, Item, MapStage, Record
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.store import Artifact, Draft
+    from stages.graphics.cameras import Camera
+    from stages.neuras.evaluation.renderers import Scene
+    from stages.neuras.evaluation.views import Examiner
+
+
+class EvaluateConfig(StageConfig):
+    splits: tuple[Literal["validation", "test", "shift"], ...] = Field(("test", "shift"), min_length=1)
+    warping_views: int = Field(4, ge=1)  # nearest photos that warping takes for a view
+    depth_tolerance: float = Field(0.05, gt=0)  # of the mesh, relative to the true depth
+    lpips: Literal["none", "vgg", "alex"] = "none"
+    lpips_folder: str | None = runtime(None)  # where its weights lie
+    gallery: int = report(15, ge=0)  # views shown in the report
+    video_frames: int = report(72, ge=0)  # of each video, 0: none
+    timing_frames: int = report(3, ge=0)  # frames timed, 0: none
+    timing_size: tuple[int, int] = report((1920, 1080))  # width and height in pixels
+    page_views: int = report(6, ge=0)  # frames that a browser draws, 0: none
+
+
+class Evaluate(MapStage):
+    name: ClassVar[str] = "evaluate"
+    version: ClassVar[int] = 1
+    inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas", "fit", "bake")
+    Config: ClassVar[Any] = EvaluateConfig
+    headline: ClassVar[str | None] = "report.html"
+    reasons: ClassVar[dict[str, str]] = {"masked": "its mask leaves almost no pixel to compare"}
+
+    def slug(self, config: EvaluateConfig) -> str:
+        return "-".join(config.splits)
+
+    def part_size(self, config: EvaluateConfig, inputs: Inputs) -> int:
+        return 4
+
+    def environment(self, config: EvaluateConfig, previous: dict[str, Any] | None) -> dict[str, Any]:
+        """What draws by OpenGL, one for the whole artifact: another rounds otherwise. None: nothing does."""
+        from stages.neuras.evaluation.renderers import opengl
+
+        if previous is not None and previous["opengl"] is None:
+            return previous
+        here = opengl()
+        if previous is not None and previous["opengl"] != here:
+            raise UserError(
+                f"this evaluation was begun with {previous['opengl']}, and here is {here or 'no OpenGL'}: "
+                "go on with that one, or begin anew with force=evaluate"
+            )
+        return {"opengl": here}
+
+    def items(self, config: EvaluateConfig, inputs: Inputs) -> Iterator[Item]:
+        rows = [row for row in inputs["capture"].rows() if row.group in config.splits]
+        if not rows:
+            raise UserError(
+                f"evaluate.splits={list(config.splits)}: the capture has no such frame; capture.split holds some out"
+            )
+        return (Item(row.id, row.group) for row in rows)
+
+    def open(self, config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any]) -> tuple[Examiner, Artifact]:
+        import torch
+
+        from stages.neuras.evaluation.renderers import Scene
+        from stages.neuras.evaluation.scores import scorers
+        from stages.neuras.evaluation.views import Examiner, warping
+
+        torch.set_num_threads(1)  # sums in another order round differently
+        scene, capture = Scene.of(inputs), inputs["capture"]
+        reference = scene.reference()
+        examiner = Examiner(
+            reference,
+            {} if environment["opengl"] is None else {kind: scene.drawing(kind) for kind in ("fp16", "rgba8")},
+            warping(capture, reference, scene.info.radius, config.warping_views),
+            scorers(config.lpips, config.lpips_folder),
+            config.depth_tolerance,
+        )
+        return examiner, capture
+
+    def process(self, worker: tuple[Examiner, Artifact], item: Item) -> Iterator[Record]:
+        from stages.graphics.arrays import pack_json
+        from stages.graphics.page import png
+        from stages.neuras.records import FrameRecord
+
+        examiner, capture = worker
+        facts, pictures = examiner.examine(FrameRecord.from_record(capture.read(item.id)))
+        yield Record(item.id, {"metrics.json": pack_json(facts), **{f"{name}.png": png(p) for name, p in pictures.items()}})
+
+    def finish(self, config: EvaluateConfig, inputs: Inputs, draft: Draft) -> None:
+        from pipeline.store.files import write_json
+        from stages.graphics.arrays import unpack_json
+        from stages.neuras.evaluation import costs, drive, report
+        from stages.neuras.evaluation.renderers import Scene
+        from stages.neuras.evaluation.summary import summarise
+        from stages.neuras.records import frames
+
+        views = [unpack_json(draft.read(row.id, ("metrics.json",)).members["metrics.json"]) for row in draft.rows()]
+        scene, site = Scene.of(inputs), inputs["bake"].file("site")
+        cameras = {frame.id: frame.camera for frame in frames(inputs["capture"], *config.splits)}
+        drawn_by = (draft.environment() or {})["opengl"]
+        summary = summarise(views)
+        summary["device"] = costs.device_bytes(scene.baked, scene.atlas)
+        summary["storage"] = costs.storage(site, scene.baked)
+        timing: dict[str, Any] = {}
+        missing = report.always_missing(config.lpips)
+        if drawn_by is None:
+            missing.append(report.NO_OPENGL)
+        elif config.timing_frames:
+            some = list(cameras.values())[:: max(1, len(cameras) // config.timing_frames)][: config.timing_frames]
+            timing["opengl"] = {"drawn_by": drawn_by, **costs.time_shader(scene, some, config.timing_size)}
+        if config.page_views:
+            missing += _page(config, scene, site, cameras, summary, timing)
+        clips = drive.videos(scene, inputs["capture"], config.video_frames, drawn_by is not None, draft.files)
+        about = report.About(inputs, draft.key, config.model_dump(mode="json"), drawn_by)
+        write_json(draft.files / "metrics.json", summary)
+        write_json(draft.files / "timing.json", timing)
+
+        def picture(frame: str, name: str) -> bytes:
+            return draft.read(frame, (f"{name}.png",)).members[f"{name}.png"]
+
+        html = report.page(about, summary, timing, missing, clips, picture)
+        (draft.files / "report.html").write_text(html, encoding="utf-8")
+        draft.note("summary", report.headline(summary))
+        for line in report.lines(summary):
+            draft.log(line)
+        draft.log(f"page: {site / 'index.html'}, to be served: python -m http.server --bind 127.0.0.1 -d {site}")
+
+    def check(self, draft: Draft) -> None:
+        assert (draft.files / "report.html").is_file(), "evaluate wrote no report"
+
+
+def _page(
+    config: EvaluateConfig,
+    scene: Scene,
+    site: Path,
+    cameras: dict[str, Camera],
+    summary: dict[str, Any],
+    timing: dict[str, Any],
+) -> list[str]:
+    """Add what a browser draws to the summary and how long it takes to the times; returns what is missing."""
+    from stages.neuras.evaluation.browsing import compare_page
+    from stages.neuras.evaluation.report import no_page
+
+    try:
+        page = compare_page(site, scene.reference(), cameras, config.page_views)
+    except RuntimeError as error:
+        return [no_page(error)]
+    summary["page"] = page["views"]
+    timing["page"] = {name: page[name] for name in ("size", "ms")}
+    return []
