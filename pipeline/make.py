@@ -8,11 +8,9 @@ import platform
 import shlex
 import shutil
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache
 from importlib import metadata
 from typing import Any
 
@@ -27,6 +25,7 @@ from pipeline.errors import (
     status_of,
 )
 from pipeline.executor import REASONS
+from pipeline.gpus import gpu_models
 from pipeline.mapping import run_map
 from pipeline.plan import Planned, RunConfig, base_key, label
 from pipeline.progress import duration
@@ -178,16 +177,6 @@ def _digest_of(store: Store, stage: str, key: str) -> str | None:
     return previous.digest if previous else None
 
 
-@cache
-def _gpu() -> str | None:
-    try:
-        query = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
-        result = subprocess.run(query, capture_output=True, text=True, timeout=20)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return result.stdout.strip() or None if result.returncode == 0 else None
-
-
 def machine(packages: Iterable[str]) -> dict[str, Any]:
     """Where an artifact was made: Python, the named packages, the GPU and its driver."""
     versions = {}
@@ -201,6 +190,6 @@ def machine(packages: Iterable[str]) -> dict[str, Any]:
         "platform": platform.platform(),
         "python": sys.version.split()[0],
         "cores": os.cpu_count(),
-        "gpu": _gpu(),
+        "gpu": gpu_models(),
         "packages": versions,
     }

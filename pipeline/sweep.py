@@ -25,6 +25,7 @@ from omegaconf import DictConfig
 
 from pipeline.errors import UserError, for_people, status_of
 from pipeline.executor import THREAD_VARIABLES
+from pipeline.gpus import VISIBLE, visible_gpus
 from pipeline.hydra_config import compose, initialized, parse_overrides, system_of, to_plain
 from pipeline.plan import Planned, hashes_of, make_plan, split_config
 from pipeline.run import run_pipeline
@@ -137,7 +138,7 @@ def run_side_by_side(jobs: Sequence[Job], at_once: int, command: Sequence[str], 
     width = max(len(name) for name in names.values())
     free: queue.SimpleQueue[Mapping[str, str]] = queue.SimpleQueue()  # one environment for each job that runs at a time
     for devices in deal(visible_gpus(), at_once):
-        own = {} if devices is None else {"CUDA_VISIBLE_DEVICES": ",".join(devices)}
+        own = {} if devices is None else {VISIBLE: ",".join(devices)}
         free.put(os.environ | dict.fromkeys(THREAD_VARIABLES, str(cores)) | own)
 
     def run(job: Job) -> int:
@@ -172,19 +173,6 @@ def run_side_by_side(jobs: Sequence[Job], at_once: int, command: Sequence[str], 
         return dict(zip(names.values(), pool.map(run, jobs), strict=True))
     finally:  # after Ctrl-C, which the running jobs get too, none starts any more
         pool.shutdown(cancel_futures=True)
-
-
-def visible_gpus() -> list[str]:
-    """The GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them; empty without an NVIDIA driver."""
-    named = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if named is not None:
-        return [device for device in named.split(",") if device]
-    try:
-        query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
-        done = subprocess.run(query, capture_output=True, text=True, timeout=20)
-    except (OSError, subprocess.TimeoutExpired):
-        return []
-    return done.stdout.split() if done.returncode == 0 else []
 
 
 def deal(gpus: Sequence[str], at_once: int) -> list[list[str] | None]:

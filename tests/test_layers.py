@@ -66,7 +66,7 @@ pipeline.stage  pipeline.status
 pipeline.store
 pipeline.config  pipeline.interrupts  pipeline.keys  pipeline.progress
 pipeline.terminal
-pipeline.errors  pipeline.atomic
+pipeline.errors  pipeline.atomic  pipeline.gpus
 pipeline
 """
 

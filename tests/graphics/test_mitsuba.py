@@ -38,7 +38,7 @@ def test_without_a_jit_backend_the_scalar_one_is_taken_with_a_word(monkeypatch, 
 
 def test_workers_spread_over_the_gpus(tmp_path, monkeypatch):
     smi = tmp_path / "nvidia-smi"
-    smi.write_text("#!/bin/sh\necho 'GPU 0: NVIDIA A (UUID: GPU-aa)'\necho 'GPU 1: NVIDIA B (UUID: GPU-bb)'\n")
+    smi.write_text("#!/bin/sh\necho GPU-aa\necho GPU-bb\n")
     smi.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setattr(backends.tempfile, "gettempdir", lambda: str(tmp_path))
@@ -56,6 +56,6 @@ def test_workers_spread_over_the_gpus(tmp_path, monkeypatch):
     backends.claim_gpu()
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "GPU-bb"
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-bb")
-    assert backends.gpus() == ["GPU-bb"] and {"backend": "cuda"} in backends.candidates("auto")
+    assert {"backend": "cuda"} in backends.candidates("auto")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert backends.gpus() == [] and {"backend": "cuda"} not in backends.candidates("auto")
+    assert {"backend": "cuda"} not in backends.candidates("auto")

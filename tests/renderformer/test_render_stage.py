@@ -86,7 +86,7 @@ def libraries(tmp_path, monkeypatch):
     """libraries("lib/libLLVM.so.19.1", ..): what this machine has of LLVM, in order; -> their paths. All of them work."""
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(backend, "_proof", lambda candidate: True)
-    monkeypatch.setattr(backend, "gpus", lambda: [])
+    monkeypatch.setattr(backend, "visible_gpus", lambda: [])
 
     def install(*names: str) -> list[str]:
         paths = [tmp_path / name for name in names]
@@ -139,7 +139,7 @@ def test_the_version_of_a_library_is_read_off_its_path(libraries):
 @pytest.mark.parametrize("visible, number", [(["GPU-a", "GPU-b"], 2), (["GPU-a"], 1), ([], 1)])
 def test_one_process_renders_on_each_gpu(monkeypatch, visible, number):
     """Each claims a GPU of its own: test_rendering.py."""
-    monkeypatch.setattr(backend, "gpus", lambda: visible)
+    monkeypatch.setattr(backend, "visible_gpus", lambda: visible)
     assert Render().max_workers(RenderConfig(), {"backend": "cuda"}) == number
     for other in (SCALAR, {"backend": "llvm", "llvm": 19}):
         assert Render().max_workers(RenderConfig(), other) is None

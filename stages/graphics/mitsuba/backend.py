@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from pipeline.errors import UserError
+from pipeline.gpus import VISIBLE, visible_gpus
 
 CHOICES = ("auto", "cuda", "llvm", "scalar")
 VARIANTS = {"cuda": "cuda_ad_rgb", "llvm": "llvm_ad_rgb", "scalar": "scalar_rgb"}
@@ -99,29 +100,17 @@ def llvm_library(backend: dict[str, Any]) -> str | None:
     return named if suits(named) else next(filter(suits, llvm_libraries()), None)
 
 
-def gpus() -> list[str]:
-    """NVIDIA GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
-    named = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if named is not None and named.strip() in ("", "-1"):
-        return []
-    if not shutil.which("nvidia-smi"):
-        return []
-    answer = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
-    found = re.findall(r"^GPU .*\(UUID: (\S+)\)", answer.stdout, re.MULTILINE) if answer.returncode == 0 else []
-    return named.split(",") if named and found else found
-
-
 _claims: list[IO] = []  # open lock files: a claim lasts as long as its process
 
 
 def claim_gpu() -> None:
     """Keep this process to one GPU, the one that fewest render processes of this machine have claimed."""
-    here = gpus()
-    if len(here) < 2 or _claims:
+    gpus = visible_gpus()
+    if len(gpus) < 2 or _claims:
         return
     folder = Path(tempfile.gettempdir()) / f"lightmill-gpus-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    for place, gpu in ((place, gpu) for place in itertools.count() for gpu in here):
+    for place, gpu in ((place, gpu) for place in itertools.count() for gpu in gpus):
         file = (folder / f"{re.sub(r'[^A-Za-z0-9-]', '_', gpu)}.{place}").open("w")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -129,14 +118,14 @@ def claim_gpu() -> None:
             file.close()
             continue
         _claims.append(file)
-        os.environ["CUDA_VISIBLE_DEVICES"] = gpu
+        os.environ[VISIBLE] = gpu
         return
 
 
 def candidates(choice: str) -> list[dict[str, Any]]:
     """Backends to try for a choice of the config, best first."""
     found: list[dict[str, Any]] = []
-    if choice in ("auto", "cuda") and gpus():
+    if choice in ("auto", "cuda") and visible_gpus():
         found.append({"backend": "cuda"})
     if choice in ("auto", "llvm"):
         libraries = [llvm_backend(path) for path in llvm_libraries() if os.path.isfile(path)]
@@ -200,7 +189,7 @@ def _title(backend: dict[str, Any]) -> str:
 
 def max_workers(backend: dict[str, Any]) -> int | None:
     """At most this many processes render at a time: one for each GPU that this process may use; None for any number."""
-    return max(1, len(gpus())) if backend["backend"] == "cuda" else None
+    return max(1, len(visible_gpus())) if backend["backend"] == "cuda" else None
 
 
 def activate(backend: dict[str, Any], threads: int | None = None) -> None:
