@@ -235,7 +235,7 @@ def timed_stage(root: dict[str, Any], stage: str, workers: int) -> tuple[float, 
     arrived: list[Arrival] = []
     run_parts = mapping.run_parts
 
-    def noting(tasks: Any, workers: int, threads: int, limits: Any, on_result: Any, log: Any) -> None:
+    def noting(tasks: Any, workers: int, threads: int, on_result: Any, log: Any) -> None:
         assert threads == 1
         began = time.perf_counter()
 
@@ -244,7 +244,7 @@ def timed_stage(root: dict[str, Any], stage: str, workers: int) -> tuple[float, 
             arrived.append(Arrival(result.part_key, WORKER.search(log.read_text())[1], at))
             on_result(result)
 
-        run_parts(tasks, workers, threads, limits, note, log)
+        run_parts(tasks, workers, threads, note, log)
 
     kind = type(load_system(root["system"]).stage(stage))
     with (

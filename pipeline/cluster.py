@@ -25,7 +25,7 @@ from pebble import ProcessExpired
 from pydantic import Field, model_validator
 
 from pipeline.code import code_digest
-from pipeline.config import Limits, Section, StageConfig, nearest
+from pipeline.config import Section, StageConfig, nearest
 from pipeline.errors import MachineError, UserError
 from pipeline.executor import PoolBroken, open_pool, run_on
 from pipeline.stage import load_system
@@ -123,8 +123,12 @@ def _pool(guard: str) -> Any:
     return get_worker().plugins[guard].working_pool()
 
 
-def _make_part(task: PartTask, limits: Limits, code: str, guard: str) -> tuple[PartResult | UserError, list[str]]:
-    """One part, and what there is to say of it. What a person must mend is returned, not raised: another try would not help."""
+def _make_part(task: PartTask, code: str, guard: str) -> tuple[PartResult | UserError, list[str]]:
+    """Make one part; returns its result and lines for people.
+
+    What a person must mend is returned, not raised, because Dask would try again. ``code`` is the digest of the runner's code
+    of the stage, ``guard`` the name of the plugin that has the processes.
+    """
     here = socket.gethostname()
     if not task.draft.is_dir():
         return UserError(f"{here} sees no {task.draft}: executor=dask needs a store that all machines have under one path"), []
@@ -134,7 +138,7 @@ def _make_part(task: PartTask, limits: Limits, code: str, guard: str) -> tuple[P
     lines: list[str] = []
     running_file(task.draft, task.part_key).unlink(missing_ok=True)  # of a lost worker, whose process numbers mean nothing here
     try:
-        run_on(_pool(guard), iter([task]), 1, limits, results.append, lines.append)
+        run_on(_pool(guard), iter([task]), 1, results.append, lines.append)
     except UserError as error:
         return error, lines
     except PoolBroken:  # raised, so that Dask tries again; this one can travel
@@ -246,11 +250,13 @@ class Cluster:
     def run_parts(
         self,
         tasks: Iterable[PartTask],
-        limits: Limits,
         on_result: Callable[[PartResult], None],
         log: Callable[[str], None],
     ) -> None:
-        """Run all tasks on whatever workers the scheduler has, as they come and go."""
+        """Make all parts by whatever workers the scheduler has, as they come and go.
+
+        ``on_result`` gets each result as it comes. ``log`` gets lines for people.
+        """
         from distributed import KilledWorker
 
         client, waiting, run = self._client, iter(tasks), uuid.uuid4().hex[:8]
@@ -263,7 +269,7 @@ class Cluster:
                         break
                     code = _code(task.system, task.stage)
                     key = f"{task.stage}-{run}", task.part_key
-                    future = client.submit(_make_part, task, limits, code, self._guard, key=key, pure=False, retries=RETRIES)
+                    future = client.submit(_make_part, task, code, self._guard, key=key, pure=False, retries=RETRIES)
                     flying[future] = task
                 if not flying:
                     return
@@ -287,10 +293,10 @@ class Cluster:
             client.cancel(list(flying))
 
     def _wait(self, futures: list[Any], log: Callable[[str], None]) -> list[Any]:
-        """Those that are done, at least one; says from time to time that there is no worker."""
+        """The futures that are done, at least one. From time to time a line says that there is no worker."""
         from distributed import wait
 
-        told = time.monotonic()
+        last_message_time = time.monotonic()
         while True:
             with contextlib.suppress(TimeoutError):
                 done = wait(futures, timeout=2.0, return_when="FIRST_COMPLETED").done
@@ -300,9 +306,9 @@ class Cluster:
                 return list(done)
             if self._client.status not in ("running", "connecting"):
                 raise MachineError(GONE)
-            if time.monotonic() - told > TELL_EVERY_S and not self._client.nthreads():
+            if time.monotonic() - last_message_time > TELL_EVERY_S and not self._client.nthreads():
                 log(f"dask: waiting, {self._client.scheduler.address} has no worker")
-                told = time.monotonic()
+                last_message_time = time.monotonic()
 
 
 def _wait_until_visible(task: PartTask) -> None:

@@ -26,7 +26,6 @@ from typing import Any
 import psutil
 from pebble import ProcessExpired, ProcessPool
 
-from pipeline.config import Limits
 from pipeline.errors import MachineError
 from pipeline.worker import (
     THREADS_VARIABLE,
@@ -72,11 +71,13 @@ def run_parts(
     tasks: Iterable[PartTask],
     workers: int,
     threads: int,
-    limits: Limits,
     on_result: Callable[[PartResult], None],
     log: Callable[[str], None],
 ) -> None:
-    """Run all tasks on ``workers`` processes with ``threads`` native threads each; 0 workers: in this process, unprotected."""
+    """Make all parts by ``workers`` processes with ``threads`` native threads each; with 0, in this process, unprotected.
+
+    ``on_result`` gets each result as it comes. ``log`` gets lines for people.
+    """
     if workers == 0:
         try:
             for task in tasks:
@@ -88,7 +89,7 @@ def run_parts(
     for _ in range(MAX_POOLS):
         try:
             with open_pool(workers, threads) as pool:
-                run_on(pool, waiting, workers, limits, on_result, log)
+                run_on(pool, waiting, workers, on_result, log)
             return
         except PoolBroken as broken:
             log("the worker processes died before they began, or while they were given work: starting new ones")
@@ -138,11 +139,10 @@ def run_on(
     pool: ProcessPool,
     waiting: Iterator[PartTask],
     workers: int,
-    limits: Limits,
     on_result: Callable[[PartResult], None],
     log: Callable[[str], None],
 ) -> None:
-    """Run all tasks on the pool's ``workers``, at most twice as many at a time, and hold their items to the limits."""
+    """Make all parts by the pool's ``workers``, at most twice as many at a time, and hold each to its task's limits."""
     flying: dict[Any, PartTask] = {}
     verdicts: dict[str, Mapping[str, Any]] = {}  # part key -> reject, for the kills that we made ourselves
     deaths: dict[str, int] = {}  # part key -> workers that died over it
@@ -191,7 +191,7 @@ def run_on(
                     ) from None
                 submit(_after_death(task, death, verdicts.pop(task.part_key, None), log))
         for task in flying.values():
-            _hold_to_limits(task, limits, verdicts)
+            _hold_to_limits(task, verdicts)
 
 
 def _after_death(
@@ -219,13 +219,15 @@ def _after_death(
 
 
 def _read_running(path: Path) -> dict[str, Any] | None:
+    """What a worker says it is at; None where it says nothing."""
     try:
         return json.loads(path.read_bytes())
     except (OSError, ValueError):
         return None
 
 
-def _hold_to_limits(task: PartTask, limits: Limits, verdicts: dict[str, Mapping[str, Any]]) -> None:
+def _hold_to_limits(task: PartTask, verdicts: dict[str, Mapping[str, Any]]) -> None:
+    """Kill the part's worker if it is over a limit. ``verdicts`` then has the reject of the item, by the part's key."""
     state = _read_running(running_file(task.draft, task.part_key))
     if state is None:
         return
@@ -239,6 +241,7 @@ def _hold_to_limits(task: PartTask, limits: Limits, verdicts: dict[str, Mapping[
     except psutil.Error:
         return
     wall_s = time.monotonic() - state["monotonic"]
+    limits = task.limits
     if state["item"] is None:  # it opens: no item pays for that, and it has a limit of its own
         limits = limits.model_copy(update={"cpu_s": math.inf, "wall_s": task.open_wall_s})
     if cpu_s > limits.cpu_s:

@@ -14,22 +14,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import metadata
 from typing import Any
 
-from pipeline.cluster import Cluster
 from pipeline.code import code_digest, commit
-from pipeline.errors import (
-    INTERRUPTED,
-    STORAGE_ERRORS,
-    Damaged,
-    MachineError,
-    for_people,
-    status_of,
-)
+from pipeline.errors import INTERRUPTED, STORAGE_ERRORS, Damaged, MachineError, for_people, status_of
 from pipeline.executor import REASONS
 from pipeline.gpus import gpu_models
+from pipeline.making import Making, Run
 from pipeline.mapping import run_map
-from pipeline.plan import Planned, RunConfig, base_key, label
+from pipeline.plan import Planned, base_key
 from pipeline.progress import duration
-from pipeline.stage import MapStage, RunStage, System
+from pipeline.stage import MapStage, RunStage
 from pipeline.status import RunState
 from pipeline.store import DRAFT, SCHEMA, Artifact, Claim, Draft, Store
 
@@ -51,125 +44,174 @@ def describe(artifact: Artifact) -> str:
 
 
 def make_artifact(
-    run: RunConfig,
-    system: System,
-    planned: Planned,
-    inputs: Mapping[str, Artifact],
-    store: Store,
-    command: Sequence[str],
-    out: Callable[[str], None],
-    plan: Sequence[str] = (),
-    cluster: Cluster | None = None,
-    adopt: Callable[[Draft], None] | None = None,
+    run: Run, planned: Planned, inputs: Mapping[str, Artifact], adopt: Callable[[Draft], None] | None = None
 ) -> Artifact:
-    """Compute one artifact and commit it. ``plan``: the whole run's stages, for its state; ``adopt`` fills a repair's draft."""
-    name, key = planned.name, planned.key
-    forced, retried = name in run.force, name in run.retry
-    claim = store.claim(planned.place, key)
-    draft_path = store.draft_path(planned.place, key)
+    """Compute one artifact and commit it; returns that of another process which makes it meanwhile.
+
+    ``inputs``: by role. ``adopt`` fills the draft of a repair with what is sound.
+    """
+    name = planned.name
+    forced, retried = name in run.settings.force, name in run.settings.retry
+    claim = run.store.claim(planned.place, planned.key)
+    draft: Draft | None = None
     state: RunState | None = None
     began = time.monotonic()
     try:
-        made = _take(claim, store, planned, forced, lambda text: out(f"{label(system, name)} {text}"))
-        if made is not None and not (retried and machine_rejects(made)):
-            return made
-
-        def say(text: str) -> None:
-            if state is not None:
-                state.update(line=text)
-            out(text)
-
-        origin = {"system": run.system, "config": planned.config.model_dump(mode="json")}
-        code = code_digest(system, name)
-        purpose = "repair" if adopt is not None else "force" if forced else "make"
-        draft = store.draft(planned.place, key, planned.preimage, say, origin, purpose, code)
-        draft.sweep()
-        state = RunState(draft.path, command=shlex.join(command), plan=list(plan))
+        _take(claim, run, planned)
+        existing = None if forced else run.store.find(planned.place, planned.key)
+        if existing is not None and not (retried and machine_rejects(existing)):
+            return existing
+        code = code_digest(run.system, name)
+        draft, state = _begin(run, planned, "repair" if adopt is not None else "force" if forced else "make", code)
         started = time.time()
-        old_digest = _digest_of(store, planned.place, key)
+        old_digest = _digest_of(run.store, planned.place, planned.key)
         if adopt is not None:
             adopt(draft)
-        if made is not None and draft.environment() is None:
-            draft.set_environment(made.manifest["environment"])  # its records are taken over
-        environment = draft.environment()
-        if cluster is not None and isinstance(planned.stage, MapStage):
-            environment = cluster.environment(run.system, name, planned.config, environment)
-        else:
-            environment = planned.stage.environment(planned.config, environment)
+        if existing is not None and draft.environment() is None:
+            draft.set_environment(existing.manifest["environment"])  # its records are taken over
+        environment = _environment(run, planned, draft.environment())
         draft.set_environment(environment)
-        if isinstance(planned.stage, MapStage):
-            products: list[str] = []
-            run_map(run, system, planned, planned.stage, inputs, environment, store, cluster, draft, forced, out, state)
-        else:
-            assert isinstance(planned.stage, RunStage)
-            out(f"{label(system, name)} running    {planned.stage.slug(planned.config)}-{key[:12]}")
-            products = planned.stage.run(planned.config, inputs, draft)
-            draft.use_parts([])
-        others = [other for other in draft.codes() if other != code]
-        manifest = {
-            "schema": SCHEMA,
-            "key": key,
-            "preimage": planned.preimage,
-            "base_key": base_key(planned),
-            **origin,
-            "code": {"digest": code, **commit(), **({"others": others} if others else {})},
-            "environment": environment,
-            "machine": machine(system.packages),
-            "outputs": draft.outputs(products),
-            "summary": draft.summary,
-            "command": shlex.join(command),
-            "started": started,
-            "finished": time.time(),
-            "seconds": time.monotonic() - began,
-        }
-        artifact = store.commit(draft, planned.stage.slug(planned.config), manifest, replace=forced or retried)
+        making = Making(run, planned, inputs, environment, draft, state)
+        products = _compute(making)
+        manifest = {**_manifest(making, products, code), "started": started}
+        manifest |= {"finished": time.time(), "seconds": time.monotonic() - began}
+        artifact = run.store.commit(draft, planned.stage.slug(planned.config), manifest, replace=forced or retried)
     except BaseException as error:
-        if not (draft_path / DRAFT).exists() and isinstance(error, Exception) and not (forced or retried):
-            made = store.find(planned.place, key)
-            if made is not None:  # another process took the claim from us, and was faster
-                shutil.rmtree(draft_path, ignore_errors=True)
-                out(f"{label(system, name)} done       {describe(made)}  by another process meanwhile")
-                return made
-        if isinstance(error, OSError) and (error.errno in STORAGE_ERRORS or str(error.filename).startswith(f"{store.root}/")):
-            where = f" ({error.filename})" if error.filename else ""
-            remedy = "make room or mend the disk, and" if error.errno in STORAGE_ERRORS else "--debug says who asked for it;"
-            error = MachineError(
-                f"{name}: the store at {store.root} cannot be read or written: {error.strerror}{where}. Finished parts are "
-                f"kept: {remedy} run the same command again"
-            )
-        if isinstance(error, Exception) and not for_people(error):
-            error.add_note(f"in stage {name} ({draft_path})")
-        if state is not None:
-            with contextlib.suppress(OSError):
-                draft.sweep()  # on a full disk it is room to go on with
-            interrupted = isinstance(error, KeyboardInterrupt)
-            message = "interrupted" if interrupted else str(error) if for_people(error) else repr(error)
-            state.end(INTERRUPTED if interrupted else status_of(error), message)
+        if not (forced or retried) and (other := _made_by_another(run, planned, error)) is not None:
+            return other
+        error = _explained(error, run, planned)
+        if draft is not None and state is not None:
+            _end(draft, state, error)
         raise error
     finally:
         claim.release()
-    verdict = ""
-    if (forced or retried) and old_digest is not None:
-        verdict = "  equal to before" if artifact.digest == old_digest else "  DIFFERENT from before"
-        if artifact.digest != old_digest:
-            verdict += f" ({old_digest[:12]} is now {artifact.digest[:12]}); later stages still hold what was made from the old"
-    out(f"{label(system, name)} done       {describe(artifact)}  in {duration(time.monotonic() - began)}{verdict}")
+    verdict = _verdict(old_digest, artifact.digest) if forced or retried else ""
+    run.say(name, f"done       {describe(artifact)}  in {duration(time.monotonic() - began)}{verdict}")
     return artifact
 
 
-def _take(claim: Claim, store: Store, planned: Planned, forced: bool, say: Callable[[str], None]) -> Artifact | None:
-    """Wait for the claim. Returns the artifact if another process has made it by then."""
-    told = False
+def _take(claim: Claim, run: Run, planned: Planned) -> None:
+    """Wait for the claim, and say once who holds it."""
+    said = False
     while not claim.take():
-        if not told and (holder := claim.holder()) is not None:
-            say(f"waiting: process {holder['pid']} on {holder['host']} is making {planned.key[:12]}")
-            told = True
+        if not said and (holder := claim.holder()) is not None:
+            text = f"waiting: process {holder['pid']} on {holder['host']} is making {planned.key[:12]}"
+            run.say(planned.name, text)
+            said = True
         time.sleep(0.5)
-    return None if forced else store.find(planned.place, planned.key)
+
+
+def _begin(run: Run, planned: Planned, purpose: str, code: str) -> tuple[Draft, RunState]:
+    """The draft to work in, new or left by an interrupted run, and the state that this run writes into it.
+
+    ``purpose``: make, force or repair. ``code``: the digest of the code at work.
+    """
+    state: RunState | None = None
+
+    def say(text: str) -> None:
+        if state is not None:
+            state.update(line=text)
+        run.out(text)
+
+    draft = run.store.draft(planned.place, planned.key, planned.preimage, say, _origin(run, planned), purpose, code)
+    draft.sweep()
+    state = RunState(draft.path, command=shlex.join(run.command), plan=list(run.stages))
+    return draft, state
+
+
+def _origin(run: Run, planned: Planned) -> dict[str, Any]:
+    """What it takes, beside the preimage, to make the artifact anew."""
+    return {"system": run.settings.system, "config": planned.config.model_dump(mode="json")}
+
+
+def _environment(run: Run, planned: Planned, previous: dict[str, Any] | None) -> dict[str, Any]:
+    """The stage's runtime choices where it will run; ``previous``: those that the draft was begun with."""
+    if run.cluster is not None and isinstance(planned.stage, MapStage):
+        return run.cluster.environment(run.settings.system, planned.name, planned.config, previous)
+    return planned.stage.environment(planned.config, previous)
+
+
+def _compute(making: Making) -> list[str]:
+    """Fill the draft; returns the names of the files that enter the artifact's digest."""
+    planned, draft = making.planned, making.draft
+    if isinstance(planned.stage, MapStage):
+        run_map(making)
+        return []
+    assert isinstance(planned.stage, RunStage)
+    making.say(f"running    {planned.stage.slug(planned.config)}-{planned.key[:12]}")
+    products = planned.stage.run(planned.config, making.inputs, draft)
+    draft.use_parts([])
+    return products
+
+
+def _manifest(making: Making, products: Sequence[str], code: str) -> dict[str, Any]:
+    """What the artifact says of itself, but for its times. ``code``: the digest of the code that ends it."""
+    run, planned, draft = making.run, making.planned, making.draft
+    others = [other for other in draft.codes() if other != code]
+    return {
+        "schema": SCHEMA,
+        "key": planned.key,
+        "preimage": planned.preimage,
+        "base_key": base_key(planned),
+        **_origin(run, planned),
+        "code": {"digest": code, **commit(), **({"others": others} if others else {})},
+        "environment": making.environment,
+        "machine": machine(run.system.packages),
+        "outputs": draft.outputs(products),
+        "summary": draft.summary,
+        "command": shlex.join(run.command),
+    }
+
+
+def _made_by_another(run: Run, planned: Planned, error: BaseException) -> Artifact | None:
+    """The artifact, if the error comes of another process that took the claim and was faster; None otherwise."""
+    draft_path = run.store.draft_path(planned.place, planned.key)
+    if (draft_path / DRAFT).exists() or not isinstance(error, Exception):
+        return None
+    artifact = run.store.find(planned.place, planned.key)
+    if artifact is not None:
+        shutil.rmtree(draft_path, ignore_errors=True)
+        run.say(planned.name, f"done       {describe(artifact)}  by another process meanwhile")
+    return artifact
+
+
+def _explained(error: BaseException, run: Run, planned: Planned) -> BaseException:
+    """The error, or one that says what to do where the store's disk is at fault; a bug is noted with its stage."""
+    root = run.store.root
+    if isinstance(error, OSError) and (error.errno in STORAGE_ERRORS or str(error.filename).startswith(f"{root}/")):
+        where = f" ({error.filename})" if error.filename else ""
+        remedy = "make room or mend the disk, and" if error.errno in STORAGE_ERRORS else "--debug says who asked for it;"
+        return MachineError(
+            f"{planned.name}: the store at {root} cannot be read or written: {error.strerror}{where}. Finished parts are "
+            f"kept: {remedy} run the same command again"
+        )
+    if isinstance(error, Exception) and not for_people(error):
+        error.add_note(f"in stage {planned.name} ({run.store.draft_path(planned.place, planned.key)})")
+    return error
+
+
+def _end(draft: Draft, state: RunState, error: BaseException) -> None:
+    """Leave the draft in order, with a word on why the run stopped."""
+    with contextlib.suppress(OSError):
+        draft.sweep()  # on a full disk it is room to go on with
+    if isinstance(error, KeyboardInterrupt):
+        state.end(INTERRUPTED, "interrupted")
+    else:
+        state.end(status_of(error), str(error) if for_people(error) else repr(error))
+
+
+def _verdict(old_digest: str | None, digest: str) -> str:
+    """How the artifact compares with the one that it replaces; empty where none could say what it was."""
+    if old_digest is None:
+        return ""
+    if old_digest == digest:
+        return "  equal to before"
+    change = f"{old_digest[:12]} is now {digest[:12]}"
+    return f"  DIFFERENT from before ({change}); later stages still hold what was made from the old"
 
 
 def _digest_of(store: Store, stage: str, key: str) -> str | None:
-    """The digest of the artifact that is about to be replaced, if it is there and can still say so."""
+    """The digest of the artifact that is about to be replaced; None where there is none, or it is too damaged to say."""
     try:
         previous = store.find(stage, key)
     except Damaged:

@@ -7,25 +7,20 @@ import gc
 import itertools
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.cluster import Cluster
 from pipeline.config import Limits
-from pipeline.errors import (
-    Damaged,
-    ItemsFailed,
-    MachineError,
-    TooManyRejects,
-)
+from pipeline.errors import Damaged, ItemsFailed, MachineError, TooManyRejects
 from pipeline.executor import run_parts
 from pipeline.keys import digest_of
-from pipeline.plan import Planned, RunConfig, base_key, item_keys, label
+from pipeline.making import Making
+from pipeline.plan import Planned, base_key, item_keys
 from pipeline.progress import Progress
-from pipeline.stage import Item, MapStage, System
-from pipeline.status import RunState
-from pipeline.store import Artifact, Draft, Store
+from pipeline.stage import Item, MapStage
+from pipeline.store import Artifact, Draft
 from pipeline.worker import PartResult, PartTask, Reuse, log_file
 
 
@@ -53,116 +48,141 @@ def _without_gc() -> Iterator[None]:
             gc.enable()
 
 
-def run_map(
-    run: RunConfig,
-    system: System,
-    planned: Planned,
-    stage: MapStage,
-    inputs: Mapping[str, Artifact],
-    environment: dict[str, Any],
-    store: Store,
-    cluster: Cluster | None,
-    draft: Draft,
-    forced: bool,
-    out: Callable[[str], None],
-    state: RunState,
-) -> None:
-    config = planned.config
-    with _without_gc():
-        items = sorted(stage.items(config, inputs), key=lambda item: (item.group, item.id))
-        if len({item.id for item in items}) != len(items):
-            raise AssertionError(f"{planned.name} lists an item twice")
-        keys = item_keys(planned, items, inputs)
-        donors = {} if forced else _donations(planned, store, environment, keys, draft)
-        parts: dict[str, tuple[str, tuple[Item, ...], tuple[str, ...]]] = {}
-        for group, indices in _parts(items, keys, stage.part_size(config, inputs)):
-            part_item_keys = tuple(keys[index] for index in indices)
-            part_key = digest_of({"group": group, "items": part_item_keys})
-            parts[part_key] = group, tuple(items[index] for index in indices), part_item_keys
-        markers, damaged = draft.sound_markers(
-            {key: [item.id for item in part_items] for key, (_, part_items, _) in parts.items()}
-        )
-        unfinished = draft.unfinished_parts()
-        limits = Limits(**{**stage.limits, **config.limits.model_dump(exclude_none=True)})
-        tasks: list[PartTask] = []
-        fresh: dict[str, int] = {}  # part key -> items to compute
-        total, again = len(items), 0
-        for part_key, (group, part_items, part_item_keys) in parts.items():
-            marker = markers[part_key] or unfinished.get(part_key, {"items": [], "rejects": []})
-            allowed = {reject["item"] for reject in marker["rejects"] if limits.exceed(reject)}
-            kept = set(marker["items"]) - allowed
-            if len(kept) == len(part_items) and markers[part_key] is not None:
-                state.add_rejects(Counter(reject["reason"] for reject in marker["rejects"]))
-                continue
-            again += len(allowed)
-            wanted = zip(part_items, part_item_keys, strict=True)
-            reuse = {item.id: donors[item_key] for item, item_key in wanted if item_key in donors and item.id not in kept}
-            fresh[part_key] = len(part_items) - len(kept) - len(reuse)
-            tasks.append(
-                PartTask(
-                    run.system, planned.name, planned.key, config, inputs, environment, draft.path,
-                    part_key, group, part_items, part_item_keys, reuse, limits=limits, open_wall_s=stage.open_wall_s,
-                )
-            )  # fmt: skip
-    part_keys = list(parts)
-    # There may be millions, and workers and what follows need the room; what is to be made is in the tasks.
-    del items, keys, donors, parts, markers, unfinished
-    reused = total - sum(fresh.values())
-    if not forced:
-        sources: dict[Path, _Source] = {}
-        tasks = [task for task in tasks if not _link_whole(task, sources, draft)]
-    name_label = label(system, planned.name)
-    if again:
-        out(f"{name_label} {again} item(s) that lower limits rejected before are tried again")
-    if damaged:
-        out(f"{name_label} {damaged} finished part(s) of the interrupted run are damaged and made again")
-    out(f"{name_label} running    {total} items" + (f", {reused} of them already there" if reused else ""))
-    progress = Progress(f"{name_label}", total, reused)
-    failed: list[tuple[str, str, Path]] = []
-    state.update(now=True, parts=len(part_keys), total=total, reused=reused, done=reused)
+@dataclass
+class _Work:
+    """What a map stage has to do and what is there already, without the items themselves: there may be millions."""
 
-    def on_result(result: PartResult) -> None:
-        log = log_file(draft.path, result.part_key)
-        for item, trace in result.failed:
-            failed.append((item, trace, log))
-            state.add_failure(item, trace, log)
-        progress.add(max(0, fresh[result.part_key] - len(result.failed)), sum(result.rejects.values()))
-        state.add_rejects(result.rejects)
-        state.update(now=bool(result.failed), done=progress.done)
+    part_keys: list[str] = field(default_factory=list)  # of all parts, in the artifact's order
+    tasks: list[PartTask] = field(default_factory=list)  # parts to make
+    missing: dict[str, int] = field(default_factory=dict)  # part key -> items to compute
+    items: int = 0  # in all
+    retried: int = 0  # items that lower limits rejected before
+    damaged: int = 0  # finished parts whose bytes are not those that were written
 
-    workers = config.workers if config.workers is not None else run.workers
-    cores = os.cpu_count() or 1
-    workers = cores if workers == "auto" else workers
-    limit = stage.max_workers(config, environment)
-    workers = min(workers, limit) if limit is not None else workers
-    workers = min(workers, len(tasks)) if workers else 0
-    if tasks:
-        try:
+    @property
+    def reused(self) -> int:
+        """Items that need no computing."""
+        return self.items - sum(self.missing.values())
+
+
+def run_map(making: Making) -> None:
+    """Make all parts of a map stage's draft, then the files that the stage makes of all records.
+
+    ItemsFailed where items raised, TooManyRejects where too few are left. Either keeps what is finished for the next run.
+    """
+    draft, config, inputs, stage = making.draft, making.planned.config, making.inputs, making.planned.stage
+    assert isinstance(stage, MapStage)
+    work = _list_work(making, stage)
+    if not making.forced:
+        work.tasks = _link_whole_parts(work.tasks, draft)
+    if work.retried:
+        making.say(f"{work.retried} item(s) that lower limits rejected before are tried again")
+    if work.damaged:
+        making.say(f"{work.damaged} finished part(s) of the interrupted run are damaged and made again")
+    making.say(f"running    {work.items} items" + (f", {work.reused} of them already there" if work.reused else ""))
+    tally = _Tally(making, work)
+    try:
+        if work.tasks:
             draft.prepared.mkdir(exist_ok=True)
             stage.prepare(config, inputs, draft.prepared)
-            if cluster is not None:
-                cluster.run_parts(tasks, limits, on_result, progress.log)
-            else:
-                run_parts(tasks, workers, max(1, cores // max(workers, 1)), limits, on_result, progress.log)
-        finally:
-            progress.close()
-    if failed:
-        item, trace, log = failed[0]
-        last = trace.strip().splitlines()[-1]
-        names = ", ".join(item for item, _, _ in failed[:8]) + (", ..." if len(failed) > 8 else "")
-        raise ItemsFailed(
-            f"{planned.name}: {len(failed)} item(s) failed: {names}. The first: {last}. Its traceback: {log} "
-            "(`lightmill status` names the others'). Everything else is kept; run again to continue"
-        )
-    draft.use_parts(_finished(planned.name, draft, part_keys))
-    _check_rejects(planned, stage, draft, total)
+            _make_parts(making, stage, work.tasks, tally)
+    finally:
+        tally.progress.close()
+    tally.check_failures()
+    draft.use_parts(_finished(making.planned.name, draft, work.part_keys))
+    _check_rejects(making.planned, draft, work.items)
     for path in sorted(draft.files.rglob("*"), reverse=True):  # what an interrupted finish left
         path.unlink() if path.is_file() else path.rmdir()
     stage.finish(config, inputs, draft)
     stage.check(draft)
 
 
+@_without_gc()
+def _list_work(making: Making, stage: MapStage) -> _Work:
+    """List the stage's parts, and make a task of each that lacks an item."""
+    planned, draft, inputs = making.planned, making.draft, making.inputs
+    config = planned.config
+    items = sorted(stage.items(config, inputs), key=lambda item: (item.group, item.id))
+    if len({item.id for item in items}) != len(items):
+        raise AssertionError(f"{planned.name} lists an item twice")
+    keys = item_keys(planned, items, inputs)
+    reusable = {} if making.forced else _reusable_items(making, keys)
+    parts: dict[str, tuple[str, tuple[Item, ...], tuple[str, ...]]] = {}
+    for group, indices in _parts(items, keys, stage.part_size(config, inputs)):
+        part_item_keys = tuple(keys[index] for index in indices)
+        part_key = digest_of({"group": group, "items": part_item_keys})
+        parts[part_key] = group, tuple(items[index] for index in indices), part_item_keys
+    markers, damaged = draft.sound_markers({key: [item.id for item in part_items] for key, (_, part_items, _) in parts.items()})
+    unfinished = draft.unfinished_parts()
+    limits = Limits(**{**stage.limits, **config.limits.model_dump(exclude_none=True)})
+    work = _Work(list(parts), items=len(items), damaged=damaged)
+    for part_key, (group, part_items, part_item_keys) in parts.items():
+        marker = markers[part_key] or unfinished.get(part_key, {"items": [], "rejects": []})
+        retried = {reject["item"] for reject in marker["rejects"] if limits.exceed(reject)}
+        kept = set(marker["items"]) - retried
+        if len(kept) == len(part_items) and markers[part_key] is not None:
+            making.state.add_rejects(Counter(reject["reason"] for reject in marker["rejects"]))
+            continue
+        keyed_items = zip(part_items, part_item_keys, strict=True)
+        reuse = {item.id: reusable[key] for item, key in keyed_items if key in reusable and item.id not in kept}
+        work.retried += len(retried)
+        work.missing[part_key] = len(part_items) - len(kept) - len(reuse)
+        work.tasks.append(
+            PartTask(
+                making.run.settings.system, planned.name, planned.key, config, inputs, making.environment, draft.path,
+                part_key, group, part_items, part_item_keys, reuse, limits=limits, open_wall_s=stage.open_wall_s,
+            )
+        )  # fmt: skip
+    return work
+
+
+class _Tally:
+    """What has become of the items so far: counted on the screen and in the run's state, failures by name."""
+
+    def __init__(self, making: Making, work: _Work):
+        self._making, self._missing = making, work.missing
+        self._failures: list[tuple[str, str, Path]] = []  # item, traceback, log of its part
+        self.progress = Progress(making.run.label(making.planned.name), work.items, work.reused)
+        making.state.update(now=True, parts=len(work.part_keys), total=work.items, reused=work.reused, done=work.reused)
+
+    def add(self, result: PartResult) -> None:
+        """Count a part that has been made, or made but for the items that failed."""
+        state, log = self._making.state, log_file(self._making.draft.path, result.part_key)
+        for item, trace in result.failed:
+            self._failures.append((item, trace, log))
+            state.add_failure(item, trace, log)
+        self.progress.add(max(0, self._missing[result.part_key] - len(result.failed)), sum(result.rejects.values()))
+        state.add_rejects(result.rejects)
+        state.update(now=bool(result.failed), done=self.progress.done)
+
+    def check_failures(self) -> None:
+        """ItemsFailed where items raised."""
+        if not self._failures:
+            return
+        _, trace, log = self._failures[0]
+        last = trace.strip().splitlines()[-1]
+        names = ", ".join(item for item, _, _ in self._failures[:8]) + (", ..." if len(self._failures) > 8 else "")
+        raise ItemsFailed(
+            f"{self._making.planned.name}: {len(self._failures)} item(s) failed: {names}. The first: {last}. Its traceback: "
+            f"{log} (`lightmill status` names the others'). Everything else is kept; run again to continue"
+        )
+
+
+def _make_parts(making: Making, stage: MapStage, tasks: Sequence[PartTask], tally: _Tally) -> None:
+    """Make the parts: on the run's cluster, or by processes of this machine that share its cores."""
+    if making.run.cluster is not None:
+        making.run.cluster.run_parts(tasks, tally.add, tally.progress.log)
+        return
+    config, cores = making.planned.config, os.cpu_count() or 1
+    workers = config.workers if config.workers is not None else making.run.settings.workers
+    workers = cores if workers == "auto" else workers
+    most = stage.max_workers(config, making.environment)
+    workers = min(workers, len(tasks), *([] if most is None else [most]))
+    run_parts(tasks, workers, max(1, cores // max(workers, 1)), tally.add, tally.progress.log)
+
+
 def _finished(name: str, draft: Draft, part_keys: Iterable[str]) -> Iterator[dict[str, Any]]:
+    """The parts' markers, in order. MachineError where one is gone."""
     for part_key in part_keys:
         marker = draft.marker(part_key)
         if marker is None:
@@ -170,31 +190,29 @@ def _finished(name: str, draft: Draft, part_keys: Iterable[str]) -> Iterator[dic
         yield marker
 
 
-def _check_rejects(planned: Planned, stage: MapStage, draft: Draft, total: int) -> None:
+def _check_rejects(planned: Planned, draft: Draft, items: int) -> None:
+    """TooManyRejects where a larger share of the items was rejected than the config allows."""
     rejects = draft.rejects()
-    counts: dict[str, int] = {}
-    for reject in rejects:
-        counts[reject["reason"]] = counts.get(reject["reason"], 0) + 1
-    if total and len(rejects) / total > planned.config.max_reject_share:
+    if items and len(rejects) / items > planned.config.max_reject_share:
+        counts = Counter(reject["reason"] for reject in rejects)
         listed = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
         first = rejects[0]
         raise TooManyRejects(
-            f"{planned.name}: {len(rejects)} of {total} items were rejected ({listed}), more than max_reject_share="
+            f"{planned.name}: {len(rejects)} of {items} items were rejected ({listed}), more than max_reject_share="
             f"{planned.config.max_reject_share:g}. For example {first['item']}: {first['reason']}: {first['detail']}"
         )
 
 
-def _donations(
-    planned: Planned, store: Store, environment: Mapping[str, Any], keys: Sequence[str], draft: Draft
-) -> dict[str, Reuse]:
-    """Item key -> where an earlier artifact of the same stage holds that item."""
+def _reusable_items(making: Making, keys: Sequence[str]) -> dict[str, Reuse]:
+    """Item key -> where an earlier artifact of the same stage holds that item; only of ``keys``."""
+    planned = making.planned
     base = base_key(planned)
-    found: dict[str, Reuse] = {}
+    reusable: dict[str, Reuse] = {}
     codes: dict[Path | None, list[str]] = {None: []}
     wanted: set[str] = set()
-    for artifact in store.artifacts(planned.place):
+    for artifact in making.run.store.artifacts(planned.place):
         manifest = artifact.manifest
-        if manifest["base_key"] != base or not planned.stage.same_environment(manifest["environment"], environment):
+        if manifest["base_key"] != base or not planned.stage.same_environment(manifest["environment"], making.environment):
             continue
         try:
             artifact.rows(), artifact.rejects()
@@ -204,15 +222,21 @@ def _donations(
         codes[artifact.path] = artifact.codes
         for item_key, rows in itertools.groupby(artifact.rows(), key=lambda row: row.item_key):  # an item's rows are neighbours
             if item_key in wanted:
-                found[item_key] = Reuse(artifact.path, tuple(row.id for row in rows))
+                reusable[item_key] = Reuse(artifact.path, tuple(row.id for row in rows))
         for reject in artifact.rejects():
             if reject.get("item_key") in wanted and not reject.get("machine"):
-                found[reject["item_key"]] = Reuse(reject=reject)
-    givers = {reuse.artifact for reuse in found.values()}
-    draft.made_by(
-        itertools.chain.from_iterable(codes[path] for path in givers), "what is taken over from earlier artifacts was"
+                reusable[reject["item_key"]] = Reuse(reject=reject)
+    sources = {reuse.artifact for reuse in reusable.values()}
+    making.draft.made_by(
+        itertools.chain.from_iterable(codes[path] for path in sources), "what is taken over from earlier artifacts was"
     )
-    return found
+    return reusable
+
+
+def _link_whole_parts(tasks: Sequence[PartTask], draft: Draft) -> list[PartTask]:
+    """Take over by hard link what earlier artifacts hold as whole parts; returns the tasks that are left."""
+    sources: dict[Path, _Source] = {}
+    return [task for task in tasks if not _link_whole(task, sources, draft)]
 
 
 class _Source:

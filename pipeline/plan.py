@@ -10,9 +10,7 @@ from pydantic import BaseModel, Field
 
 from pipeline.cluster import Executor, LocalExecutor
 from pipeline.config import Section, StageConfig, nearest, parse
-from pipeline.errors import (
-    UserError,
-)
+from pipeline.errors import UserError
 from pipeline.keys import LEGACY_SYSTEM, SCHEME, canonical, digest_of, digest_of_plain
 from pipeline.stage import Item, Stage, System, load_system
 from pipeline.store import Artifact, HashCache, Store, place
@@ -110,6 +108,30 @@ def make_plan(
     return plan
 
 
+@dataclass(frozen=True)
+class RunPlan:
+    """What a composed config asks for: the engine's settings, the system, and the planned stages by name, in running order."""
+
+    run: RunConfig
+    system: System
+    stages: Mapping[str, Planned]
+
+    @property
+    def keys(self) -> dict[str, str]:
+        """Stage name -> key."""
+        return {name: planned.key for name, planned in self.stages.items()}
+
+
+def plan_run(root: Mapping[str, Any]) -> RunPlan:
+    """The plan of ``root``, the composed config as plain containers.
+
+    Source files are hashed here. The store remembers their hashes for the next plan.
+    """
+    run, system, sections = split_config(root)
+    with hashes_of(Store(run.store)) as hashes:
+        return RunPlan(run, system, make_plan(run, system, sections, hashes))
+
+
 def plan_stage(
     system: str, stage: Stage, config: StageConfig, inputs: Mapping[str, str], hash_file: Callable[[Any], str]
 ) -> Planned:
@@ -161,8 +183,3 @@ def item_keys(planned: Planned, items: Sequence[Item], inputs: Mapping[str, Arti
             needs = [[name, record, inputs[name].digest_of(record)] for name, record in item.needs]
         keys.append(digest_of_plain({"base": base, "item": item.id, "source": sources.get(item.id), "needs": needs}))
     return keys
-
-
-def label(system: System, name: str) -> str:
-    """How a run's lines begin: the stage's number and name."""
-    return f"{system.number(name):02} {name:<10}"

@@ -21,6 +21,7 @@ from pipeline.config import parse
 from pipeline.errors import Damaged, UserError
 from pipeline.keys import digest_of
 from pipeline.make import make_artifact
+from pipeline.making import Run
 from pipeline.plan import Planned, RunConfig, hashes_of, plan_stage
 from pipeline.stage import MapStage, load_system
 from pipeline.store import UNKNOWN, Artifact, Draft, Row, Store, is_sound, read_draft, record_digest
@@ -37,7 +38,7 @@ def repair(store: Store, artifact: Artifact, workers: int | None = None, out: Ca
     for problem in problems:
         out(f"{name}: {problem}")
     origin = _origin(artifact)
-    run = RunConfig(
+    settings = RunConfig(
         system=origin["system"],
         stage=(origin["preimage"]["stage"],),
         force=(origin["preimage"]["stage"],),
@@ -69,9 +70,8 @@ def repair(store: Store, artifact: Artifact, workers: int | None = None, out: Ca
             out(f"{name}: {planned.name} is one computation and has no parts: all of it is computed again")
 
     old_digest = _manifest(artifact).get("outputs", {}).get("digest")
-    mended = make_artifact(
-        run, load_system(run.system), planned, inputs, store, ["lightmill", "repair", name], out, adopt=adopt
-    )
+    run = Run(settings, load_system(settings.system), store, ["lightmill", "repair", name], out)
+    mended = make_artifact(run, planned, inputs, adopt)
     if old_digest is None:
         out(f"{name}: the old digest is lost with the manifest, the new one is {mended.digest[:12]}")
     return mended

@@ -12,13 +12,10 @@ from typing import Any
 
 from pipeline.cluster import Cluster, DaskExecutor
 from pipeline.code import code_digest
-from pipeline.errors import (
-    Damaged,
-    MachineError,
-    UserError,
-)
+from pipeline.errors import Damaged, MachineError, UserError
 from pipeline.make import describe, machine_rejects, make_artifact
-from pipeline.plan import Planned, RunConfig, hashes_of, label, make_plan, split_config
+from pipeline.making import Run
+from pipeline.plan import Planned, RunConfig, RunPlan, plan_run
 from pipeline.stage import RunStage
 from pipeline.store import Artifact, Store
 
@@ -26,68 +23,89 @@ LEADER_PATIENCE_S = 600.0  # a follower waits so long without a sign of the proc
 
 
 def run_pipeline(root: Mapping[str, Any], command: Sequence[str], out: Callable[[str], None] = print) -> dict[str, Any]:
-    """Make the artifacts that ``root`` (the composed config as plain containers) asks for.
+    """Plan and run what ``root`` (the composed config as plain containers) asks for; see ``run_plan``."""
+    return run_plan(plan_run(root), command, out)
 
-    Returns stage name -> artifact (None for a stage that was not needed) with the keys of the plan under ``keys``.
+
+def run_plan(plan: RunPlan, command: Sequence[str], out: Callable[[str], None] = print) -> dict[str, Any]:
+    """Make the artifacts of the plan that are missing.
+
+    Returns stage name -> artifact under ``artifacts``, with None for a stage that was not needed, and stage name -> key under
+    ``keys``.
     """
-    run, system, sections = split_config(root)
-    store = Store(run.store)
-    with hashes_of(store) as hashes:
-        plan = make_plan(run, system, sections, hashes)
-    for setting, names in (("force", run.force), ("retry", run.retry)):
+    _check_again(plan)
+    store = Store(plan.run.store)
+    artifacts, damage = _look_up(plan, store)
+    settings = plan.run.model_copy(update={"retry": tuple(name for name in plan.run.retry if machine_rejects(artifacts[name]))})
+    todo = _todo(settings, plan.stages, artifacts)
+    for name, error in damage.items():
+        if name in todo and name not in settings.force:
+            raise error
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and (again := (*settings.force, *settings.retry)):
+        raise UserError(f"force or retry={','.join(again)} needs a process of its own: run it without torchrun")
+    if int(os.environ.get("RANK", "0")) > 0 and not settings.plan:  # one of several processes that torchrun started
+        _follow(plan.stages, todo, store)
+        return {"artifacts": {}, "keys": plan.keys}
+    by_dask = isinstance(settings.executor, DaskExecutor)
+    with Cluster(settings.executor, out) if by_dask else contextlib.nullcontext() as cluster:
+        order = [name for name in plan.stages if name in todo]
+        configs = {name: planned.config for name, planned in plan.stages.items()}
+        run = Run(settings, plan.system, store, command, out, order, cluster)
+        for name, planned in plan.stages.items():
+            artifact = artifacts[name]
+            if name in todo and settings.plan:
+                run.say(name, f"to make   key {planned.key[:12]}")
+                for line in planned.stage.estimate(planned.config, configs):
+                    out(f"      {line}")
+            elif name in todo:
+                artifacts[name] = make_artifact(run, planned, planned.inputs(artifacts))
+            elif artifact is not None:
+                _say_up_to_date(run, name, artifact)
+            else:
+                run.say(name, f"not needed key {planned.key[:12]}")
+    for name in settings.stage:
+        artifact = artifacts[name]
+        headline = plan.stages[name].stage.headline
+        if artifact is not None and headline and not settings.plan:
+            out(f"{headline}: {artifact.file(headline)}")
+    return {"artifacts": artifacts, "keys": plan.keys}
+
+
+def _check_again(plan: RunPlan) -> None:
+    """UserError where ``force`` or ``retry`` names a stage that the run does not need."""
+    for setting, names in (("force", plan.run.force), ("retry", plan.run.retry)):
         for name in names:
-            if name not in plan:
-                raise UserError(f"{setting}={name}: the stage is not among those that stage={','.join(run.stage)} needs")
+            if name not in plan.stages:
+                targets = ",".join(plan.run.stage)
+                raise UserError(f"{setting}={name}: the stage is not among those that stage={targets} needs")
+
+
+def _look_up(plan: RunPlan, store: Store) -> tuple[dict[str, Artifact | None], dict[str, Damaged]]:
+    """What the store holds of the plan, None for what is missing or damaged; and what is wrong with the damaged ones."""
     artifacts: dict[str, Artifact | None] = {}
-    damaged: dict[str, Damaged] = {}
-    for name, planned in plan.items():
+    damage: dict[str, Damaged] = {}
+    for name, planned in plan.stages.items():
         try:
             artifacts[name] = store.find(planned.place, planned.key)
-            if artifacts[name] is not None and not run.plan:
+            if artifacts[name] is not None and not plan.run.plan:
                 store.touch(planned.key)  # not only at its turn, which may be days away: gc must know
         except Damaged as error:
-            artifacts[name], damaged[name] = None, error
-    run = run.model_copy(update={"retry": tuple(name for name in run.retry if machine_rejects(artifacts[name]))})
-    todo = _todo(run, plan, artifacts)
-    for name, error in damaged.items():
-        if name in todo and name not in run.force:
-            raise error
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and (again := (*run.force, *run.retry)):
-        raise UserError(f"force or retry={','.join(again)} needs a process of its own: run it without torchrun")
-    if int(os.environ.get("RANK", "0")) > 0 and not run.plan:  # one of several processes that torchrun started
-        return _follow(plan, todo, store)
-    with Cluster(run.executor, out) if isinstance(run.executor, DaskExecutor) else contextlib.nullcontext() as cluster:
-        for name, planned in plan.items():
-            artifact = artifacts[name]
-            if name in todo:
-                if run.plan:
-                    out(f"{label(system, name)} to make   key {planned.key[:12]}")
-                    for line in planned.stage.estimate(planned.config, {other: plan[other].config for other in plan}):
-                        out(f"      {line}")
-                else:
-                    inputs = planned.inputs(artifacts)
-                    assert all(inputs.values())
-                    rest = [other for other in plan if other in todo]
-                    artifacts[name] = make_artifact(run, system, planned, inputs, store, command, out, rest, cluster)  # type: ignore[arg-type]
-            elif artifact is not None:
-                store.touch(artifact.key)
-                out(f"{label(system, name)} up to date {describe(artifact)}")
-                for line in _note_rejects(artifact, command):
-                    out(line)
-                if artifact.codes != [code_digest(system, name)]:
-                    out(f"   note: the code of {name} has changed since, its version has not (force={name} recomputes)")
-            else:
-                out(f"{label(system, name)} not needed key {planned.key[:12]}")
-    for name in run.stage:
-        artifact = artifacts[name]
-        headline = plan[name].stage.headline
-        if artifact is not None and headline and not run.plan:
-            out(f"{headline}: {artifact.file(headline)}")
-    return {"artifacts": artifacts, "keys": {name: planned.key for name, planned in plan.items()}}
+            artifacts[name], damage[name] = None, error
+    return artifacts, damage
 
 
-def _follow(plan: Mapping[str, Planned], todo: set[str], store: Store) -> dict[str, Any]:
-    """What a process does that another one leads: its part of run stages, once what they read has been made."""
+def _say_up_to_date(run: Run, name: str, artifact: Artifact) -> None:
+    """Say that the artifact is there already, and what a person should know of it."""
+    run.store.touch(artifact.key)
+    run.say(name, f"up to date {describe(artifact)}")
+    for line in _note_rejects(artifact, run.command):
+        run.out(line)
+    if artifact.codes != [code_digest(run.system, name)]:
+        run.out(f"   note: the code of {name} has changed since, its version has not (force={name} recomputes)")
+
+
+def _follow(plan: Mapping[str, Planned], todo: set[str], store: Store) -> None:
+    """Do what another process leads: this one's share of run stages, each once its inputs have been made."""
 
     def leader_works() -> bool:
         """Whether some process holds the claim of a stage of this plan, at which the leader is then at work."""
@@ -110,7 +128,6 @@ def _follow(plan: Mapping[str, Planned], todo: set[str], store: Store) -> dict[s
         if name in todo and isinstance(planned.stage, RunStage):
             inputs = {role: wait_for(parent) for role, parent in planned.parents.items()}
             planned.stage.follow(planned.config, inputs)
-    return {"artifacts": {}, "keys": {name: planned.key for name, planned in plan.items()}}
 
 
 def _todo(run: RunConfig, plan: Mapping[str, Planned], artifacts: Mapping[str, Artifact | None]) -> set[str]:

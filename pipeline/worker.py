@@ -68,7 +68,7 @@ class PartTask:
     first: str | None = None  # the item to try first, alone in a fresh process: it was at work when the last one died
     killed: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # items that died twice: their rejects
     open_wall_s: float = 1800.0  # seconds on the clock that opening a worker may take
-    limits: Limits = Limits()  # of an item; whoever runs the part holds it to them, here they tell what to try again
+    limits: Limits = Limits()  # of an item: the executor holds the worker to them
 
 
 @dataclass(frozen=True)

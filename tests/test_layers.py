@@ -58,6 +58,7 @@ pipeline.sweep  pipeline.repair
 pipeline.run
 pipeline.make
 pipeline.mapping
+pipeline.making
 pipeline.plan
 pipeline.cluster
 pipeline.executor

@@ -19,7 +19,6 @@ import pytest
 
 from pipeline import cluster
 from pipeline.cluster import CLUSTERS
-from pipeline.config import Limits
 from pipeline.errors import MachineError, UserError
 from pipeline.executor import PoolBroken
 from pipeline.run import run_pipeline
@@ -153,7 +152,7 @@ def test_a_worker_whose_processes_keep_dying_is_the_machine_s_fault(tmp_path, mo
     monkeypatch.setattr("pipeline.cluster.run_on", broken)
     task = PartTask("tests.pipeline.toy", "numbers", "key", None, {}, {}, tmp_path, "part", "", (), ())
     with pytest.raises(MachineError, match="worker processes keep dying") as caught:
-        cluster._make_part(task, Limits(), "code", "guard")
+        cluster._make_part(task, "code", "guard")
     again = pickle.loads(pickle.dumps(caught.value))
     assert (type(again), str(again)) == (MachineError, str(caught.value))
 

@@ -17,10 +17,10 @@ from pipeline import commands
 from pipeline.config import Section, added, parse, runtime
 from pipeline.errors import MachineError, UserError
 from pipeline.keys import canonical, canonical_json, seed_for
+from pipeline.plan import plan_run
 from pipeline.run import run_pipeline
 from pipeline.stage import Record
 from pipeline.store import Store
-from pipeline.sweep import plan_of
 from tests.pipeline.toy import Numbers, Squares, Total
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -301,7 +301,9 @@ def untouched(draft: Path) -> None:
 def interrupted(run, store: Store) -> tuple[dict, Path]:
     """Artifacts of numbers and squares, and the draft of a total that a run left."""
     artifacts, _ = run(stage="squares")
-    planned = plan_of({"system": "tests.pipeline.toy", "stage": "total", "numbers": {}, "squares": {}, "total": {}})["total"]
+    planned = plan_run({"system": "tests.pipeline.toy", "stage": "total", "numbers": {}, "squares": {}, "total": {}}).stages[
+        "total"
+    ]
     return artifacts, store.draft("total", planned.key, planned.preimage).path
 
 
@@ -504,7 +506,7 @@ def follower(tmp_path, monkeypatch):
     monkeypatch.setattr("pipeline.run.LEADER_PATIENCE_S", 1.0)
     sections = {"numbers": {"n": 4}, "squares": {}, "total": {}}
     root = {"system": "tests.pipeline.toy", "stage": "total", "store": str(tmp_path / "store"), "workers": 0} | sections
-    return root, plan_of(root)
+    return root, plan_run(root).stages
 
 
 def test_a_follower_does_not_wait_for_a_leader_that_is_gone(follower):

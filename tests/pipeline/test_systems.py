@@ -13,10 +13,9 @@ import pytest
 from pipeline.errors import UserError
 from pipeline.hydra_config import compose
 from pipeline.keys import digest_of
-from pipeline.plan import make_plan, split_config
+from pipeline.plan import make_plan, plan_run, split_config
 from pipeline.stage import Stage, load_system
 from pipeline.store import Store
-from pipeline.sweep import plan_of
 from stages import cli
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,9 +47,9 @@ def test_a_system_runs_through_the_command_line_and_has_places_of_its_own(store)
 
 
 def test_a_key_holds_the_system_and_renderformers_does_not(tmp_path):
-    toy = plan_of(compose([TOY, f"store={tmp_path}"]))["numbers"]
+    toy = plan_run(compose([TOY, f"store={tmp_path}"])).stages["numbers"]
     assert toy.preimage["system"] == "toy" and toy.key == digest_of(toy.preimage)
-    collect = plan_of(compose(["stage=collect", f"store={tmp_path}"]))["collect"]
+    collect = plan_run(compose(["stage=collect", f"store={tmp_path}"])).stages["collect"]
     assert "system" not in collect.preimage and collect.place == "collect" and toy.place == "toy/numbers"
 
 
