@@ -24,7 +24,7 @@ for name in ("OMP_NUM_THREADS", "IGL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import numpy as np  # noqa: E402
 
 from pipeline.hydra_config import compose  # noqa: E402
-from pipeline.plan import hashes_of, make_plan, split_config  # noqa: E402
+from pipeline.plan import plan_run  # noqa: E402
 from pipeline.store import Artifact, Store, iter_inputs  # noqa: E402
 from stages.graphics.geometry import sheet  # noqa: E402
 from stages.graphics.geometry.records import MeshRecord  # noqa: E402
@@ -155,8 +155,7 @@ def main() -> int:
     asked = ["stage=decimate", f"store={arguments.store}", f"hydra.run.dir={arguments.store}/runs", *arguments.overrides]
     subprocess.run([sys.executable, "-m", "pipeline", *asked], check=True, cwd=ROOT)
     store = Store(arguments.store)
-    with hashes_of(store) as hashes:
-        planned = make_plan(*split_config(compose(["stage=decimate", *arguments.overrides])), hashes)["decimate"]
+    planned = plan_run(compose(["stage=decimate", f"store={arguments.store}", *arguments.overrides])).stages["decimate"]
     decimate = store.find(planned.place, planned.key)
     inputs = {name: artifact for name, _, artifact in iter_inputs(store, decimate)}
     collect, remesh = inputs["collect"], inputs["remesh"]

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from pipeline.errors import INTERRUPTED
 from pipeline.hydra_config import compose
 from pipeline.interrupts import guarded
-from pipeline.plan import split_config
 from pipeline.run import run_pipeline
 from pipeline.sweep import describe, expand, is_hydras, launcher_of, run_by_launcher, run_in_turn, run_side_by_side
 
@@ -42,7 +41,7 @@ def main(words: Sequence[str] | None = None) -> int:
             return
         jobs = expand(overrides)
         say(describe(jobs))
-        run = split_config(jobs[0].root)[0]
+        run = jobs[0].run_plan.run
         if launcher_of(overrides) is not None and not run.plan:
             statuses = run_by_launcher(jobs, overrides, command, say)
         elif run.jobs is not None and not run.plan:

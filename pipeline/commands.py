@@ -14,7 +14,7 @@ from typing import Any
 
 from pipeline.errors import Damaged, UserError
 from pipeline.hydra_config import compose
-from pipeline.plan import hashes_of, make_plan, split_config
+from pipeline.plan import plan_run
 from pipeline.progress import duration
 from pipeline.repair import repair
 from pipeline.status import lines, read_states
@@ -171,9 +171,7 @@ def command_why(store: Store, arguments: argparse.Namespace) -> int:
             raise UserError(f"{first} is of stage {old.stage}, {rest[0]} of {new.stage}: only like can be compared")
         _explain(store, old.manifest["preimage"], new.manifest["preimage"], "", lambda key: _preimage(store, key))
         return 0
-    run, system, sections = split_config(compose([*_choice_of_stage(store, first), *rest]))
-    with hashes_of(store) as hashes:
-        plan = make_plan(run, system, sections, hashes)
+    plan = plan_run(compose([*_choice_of_stage(store, first), *rest])).stages
     by_key = {planned.key: planned.preimage for planned in plan.values()}
     for name, planned in plan.items():
         artifact = store.find(planned.place, planned.key)

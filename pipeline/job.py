@@ -7,8 +7,8 @@ import signal
 import sys
 
 from pipeline.interrupts import guarded
-from pipeline.run import run_pipeline
-from pipeline.sweep import check_keys
+from pipeline.run import run_plan
+from pipeline.sweep import plan_again
 from pipeline.worker import die_with_parent
 
 
@@ -19,8 +19,8 @@ def main() -> int:
     job = json.load(sys.stdin)
 
     def work() -> None:
-        check_keys(job["name"], job["root"], job["keys"])
-        run_pipeline(job["root"], job["command"], lambda text: print(text, flush=True))
+        plan = plan_again(job["name"], job["root"], job["keys"])
+        run_plan(plan, job["command"], lambda text: print(text, flush=True))
 
     return guarded(work, debug=job["root"]["debug"])
 

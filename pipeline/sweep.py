@@ -15,8 +15,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -27,11 +26,10 @@ from pipeline.errors import UserError, for_people, status_of
 from pipeline.executor import THREAD_VARIABLES
 from pipeline.gpus import VISIBLE, visible_gpus
 from pipeline.hydra_config import compose, initialized, parse_overrides, system_of, to_plain
-from pipeline.plan import Planned, hashes_of, make_plan, split_config
-from pipeline.run import run_pipeline
+from pipeline.plan import Planned, RunPlan, plan_run
+from pipeline.run import run_plan
 from pipeline.store import Store
 
-Plan = Mapping[str, Planned]
 LAUNCHER = "hydra/launcher="
 
 
@@ -41,23 +39,21 @@ class Job:
 
     words: tuple[str, ...]
     root: Mapping[str, Any]
-    plan: Plan
+    run_plan: RunPlan
 
     @property
     def name(self) -> str:
         return " ".join(self.words)
 
-    @cached_property
+    @property
+    def plan(self) -> Mapping[str, Planned]:
+        """Stage name -> planned stage."""
+        return self.run_plan.stages
+
+    @property
     def keys(self) -> dict[str, str]:
         """Stage name -> key."""
-        return {name: planned.key for name, planned in self.plan.items()}
-
-
-def plan_of(root: Mapping[str, Any]) -> dict[str, Planned]:
-    """The plan of a composed config. Hashes of source files are kept for the next plan."""
-    run, system, sections = split_config(root)
-    with hashes_of(Store(run.store)) as hashes:
-        return make_plan(run, system, sections, hashes)
+        return self.run_plan.keys
 
 
 def is_hydras(word: str) -> bool:
@@ -73,13 +69,18 @@ def expand(overrides: Sequence[str]) -> list[Job]:
     except HydraException as error:
         raise UserError(str(error).splitlines()[0]) from None
     roots = {tuple(words): compose(words) for batch in batches for words in batch}
-    return [Job(words, root, plan_of(root)) for words, root in roots.items()]
+    return [Job(words, root, plan_run(root)) for words, root in roots.items()]
 
 
-def check_keys(name: str, root: Mapping[str, Any], planned_keys: Mapping[str, str]) -> None:
-    """UserError if the config gives other keys now than when the sweep began."""
-    if {stage: planned.key for stage, planned in plan_of(root).items()} != planned_keys:
+def plan_again(name: str, root: Mapping[str, Any], planned_keys: Mapping[str, str]) -> RunPlan:
+    """The job's plan at the moment when it begins, which it then runs.
+
+    UserError if its keys are not those that it had when the sweep began. A key must never name what a changed source gives.
+    """
+    plan = plan_run(root)
+    if plan.keys != planned_keys:
         raise UserError(f"the config or a source file changed after the sweep began: job {name!r} has other keys now")
+    return plan
 
 
 def shared_stages(jobs: Sequence[Job]) -> dict[str, str]:
@@ -113,8 +114,7 @@ def run_in_turn(jobs: Sequence[Job], command: Sequence[str], out: Callable[[str]
     for job in jobs:
         out(f"== {job.name}")
         try:
-            check_keys(job.name, job.root, job.keys)
-            run_pipeline(job.root, command, out)
+            run_plan(plan_again(job.name, job.root, job.keys), command, out)
             statuses[job.name] = 0
         except ValueError as error:  # UserError, and what model/ says of bad input
             if job.root["debug"] or not for_people(error):
@@ -146,7 +146,7 @@ def run_side_by_side(jobs: Sequence[Job], at_once: int, command: Sequence[str], 
             out(f"{names[job.name]:<{width}} | {text}")
 
         if job not in todo:  # says so, and that it was used
-            run_pipeline(job.root, command, say)
+            run_plan(job.run_plan, command, say)
             return 0
         root = {**job.root, "workers": cores if job.root["workers"] == "auto" else job.root["workers"]}
         environment = free.get()
@@ -185,22 +185,25 @@ def deal(gpus: Sequence[str], at_once: int) -> list[list[str] | None]:
 
 
 def _complete(job: Job) -> bool:
-    run = split_config(job.root)[0]
+    run = job.run_plan.run
     store = Store(run.store)
     planned = [job.plan[name] for name in run.stage]
     return not run.force and not run.retry and all(store.find(one.place, one.key) is not None for one in planned)
 
 
 def _make_shared(job: Job, shared: Mapping[str, str], command: Sequence[str], out: Callable[[str], None]) -> None:
-    """What all jobs read, once and with all workers, instead of by one job for which the others wait."""
-    run = split_config(job.root)[0]
+    """Make what all jobs read, once and with all workers, instead of by one job for which the others wait."""
+    plan = plan_again(job.name, job.root, job.keys)
+    run = plan.run
     for setting, names in (("force", run.force), ("retry", run.retry)):
         if ours := [name for name in names if name in shared]:
             raise UserError(
                 f"{setting}={','.join(ours)}: all jobs of the sweep share it; do that by itself, then run the sweep"
             )
     read = {parent for name in shared for parent in job.plan[name].parents.values()}
-    run_pipeline({**job.root, "stage": [name for name in shared if name not in read], "force": [], "retry": []}, command, out)
+    targets = tuple(name for name in shared if name not in read)
+    run = run.model_copy(update={"stage": targets, "force": (), "retry": ()})
+    run_plan(replace(plan, run=run, stages={name: plan.stages[name] for name in shared}), command, out)
 
 
 # -- by a launcher of Hydra
@@ -221,7 +224,7 @@ def run_by_launcher(
     from hydra.core.plugins import Plugins
     from hydra.types import HydraContext, RunMode
 
-    planned = {job.name: job.keys for job in jobs}
+    planned_keys = {job.name: job.keys for job in jobs}
     commands = list(command)
 
     def work(config: DictConfig) -> int:
@@ -230,8 +233,8 @@ def run_by_launcher(
         words = [word for word in HydraConfig.get().overrides.task if not is_hydras(word)]
         root = to_plain(config)
         try:
-            check_keys(" ".join(words), root, planned[" ".join(words)])
-            run_pipeline(root, commands, lambda text: print(text, flush=True))
+            name = " ".join(words)
+            run_plan(plan_again(name, root, planned_keys[name]), commands, lambda text: print(text, flush=True))
         except ValueError as error:
             if not for_people(error):
                 raise

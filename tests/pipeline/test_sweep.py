@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.errors import UserError
 from pipeline.store import Store
-from pipeline.sweep import check_keys, deal, describe, expand, label, run_side_by_side, shared_stages
+from pipeline.sweep import deal, describe, expand, label, plan_again, run_side_by_side, shared_stages
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -156,20 +156,17 @@ def test_a_job_whose_source_changed_after_the_sweep_began_stops(tmp_path, folder
 
     monkeypatch.setattr("pipeline.sweep._complete", change)  # side by side: asked once the keys are known
     if not jobs:
-        from pipeline import sweep
-
-        monkeypatch.setattr("pipeline.sweep.run_pipeline", change)
-        assert sweep.run_in_turn is not None
+        monkeypatch.setattr("pipeline.sweep.run_plan", change)
     assert main([*words, *jobs, "-m"]) == 2
     streams = capsys.readouterr()
     assert "changed after the sweep began" in streams.out + streams.err
 
 
-def test_check_keys_refuses_other_keys(tmp_path):
+def test_a_job_that_begins_is_planned_anew_and_refused_under_other_keys(tmp_path):
     (job,) = expand(["stage=collect", "collect.per_family=1", f"store={tmp_path}"])
-    check_keys(job.name, job.root, job.keys)
+    assert plan_again(job.name, job.root, job.keys).keys == job.keys
     with pytest.raises(UserError, match="changed after the sweep began"):
-        check_keys(job.name, job.root, {"collect": "0" * 64})
+        plan_again(job.name, job.root, {"collect": "0" * 64})
 
 
 def test_gpus_are_dealt_to_the_jobs_that_run_at_a_time():
