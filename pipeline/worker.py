@@ -18,7 +18,7 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -159,7 +159,15 @@ def run_part(task: PartTask, log: bool = True) -> PartResult:
 
 @dataclass(frozen=True)
 class _Failure:
+    """An item that raised."""
+
     trace: str
+
+    def __str__(self) -> str:
+        return f"FAILED\n{self.trace.rstrip()}"
+
+
+Outcome = list[Record] | Reject | _Failure
 
 
 class _Stopwatch:
@@ -176,17 +184,129 @@ class _Stopwatch:
 
 
 def _run_part(task: PartTask, draft: Draft) -> PartResult:
-    def say(text: str) -> None:
-        write_log(task.draft, task.part_key, text)
+    """Make the part, but for what an earlier try at it has left in the draft."""
+    maker = _PartMaker(task, draft)
+    group, host = task.group or "-", socket.gethostname()
+    maker.say(f"{len(task.items)} items of {task.stage} {group}: process {os.getpid()} on {host}")
+    finished = draft.sound_markers({task.part_key: [item.id for item in task.items]})[0][task.part_key]
+    if finished is not None and not any(task.limits.exceed(reject) for reject in finished["rejects"]):
+        maker.say("finished already, by a worker that died before it could say so")
+        return PartResult(task.part_key, Counter(reject["reason"] for reject in finished["rejects"]))
+    # a part finished under lower limits, or one of which an item failed: what they lack is computed, the rest stays as it is
+    marker = draft.marker(task.part_key, UNFINISHED if finished is None else FINISHED)
+    if marker is not None:
+        maker.keep(marker)
+    return maker.make()
 
-    watch = _Stopwatch()
 
-    def compute(item: Item) -> list[Record] | Reject:
+class _PartMaker:
+    """Makes one part: each item's records are computed or taken over, then tar and marker written."""
+
+    def __init__(self, task: PartTask, draft: Draft):
+        self._task, self._draft = task, draft
+        self._watch = _Stopwatch()
+        self._kept: dict[str, list[Row]] = {}  # item id -> its rows from an earlier try at this part
+        self._rejected = dict(task.killed)  # item id -> its reject, which stands
+
+    def say(self, text: str) -> None:
+        """Write a line to the part's log."""
+        write_log(self._task.draft, self._task.part_key, text)
+
+    def keep(self, marker: Mapping[str, Any]) -> None:
+        """Keep what the marker of an earlier try holds, but for rejects that the limits of this one may spare."""
+        for row in map(Row.from_json, marker["rows"]):
+            self._kept.setdefault(row.item, []).append(row)
+        standing = {reject["item"]: reject for reject in marker["rejects"] if not self._task.limits.exceed(reject)}
+        self._rejected = standing | self._rejected
+
+    def make(self) -> PartResult:
+        """Make all items, and write the part's tar and its marker."""
+        task = self._task
+        writer = self._draft.open_part()
+        rejects: list[dict[str, Any]] = []
+        failed: dict[str, str] = {}  # item id -> traceback
+        try:
+            early = {item.id: self._attempt(item) for item in task.items if item.id == task.first}
+            for item, item_key in zip(task.items, task.item_keys, strict=True):
+                row = {"item": item.id, "group": item.group, "item_key": item_key}
+                if item.id in self._rejected:
+                    rejects.append({**row, **self._rejected[item.id]})
+                    continue
+                outcome = early.pop(item.id) if item.id in early else self._attempt(item)
+                if isinstance(outcome, _Failure):
+                    failed[item.id] = outcome.trace
+                elif isinstance(outcome, Reject):
+                    rejects.append({**row, "reason": outcome.reason, "detail": outcome.detail})
+                else:
+                    for record in outcome:
+                        writer.add(record, item.id, item.group, item_key)
+            self._mark(writer.close(), rejects, failed)
+        except BaseException:
+            writer.discard()
+            raise
+        return PartResult(task.part_key, Counter(reject["reason"] for reject in rejects), tuple(failed.items()))
+
+    def _mark(self, tar: Mapping[str, Any], rejects: list[dict[str, Any]], failed: Collection[str]) -> None:
+        """Write the part's marker: finished, or unfinished without the items in ``failed``. ``tar``: digest, bytes and rows."""
+        task = self._task
+        items = [item.id for item in task.items if item.id not in failed]
+        marker = {**tar, "part_key": task.part_key, "group": task.group, "items": items, "rejects": rejects}
+        if not failed:
+            self._draft.finish_part(task.part_key, marker)
+        elif items:
+            self._draft.keep_unfinished(task.part_key, marker)
+        state = f"unfinished, {len(failed)} failed" if failed else "finished"
+        self.say(f"{state}: {len(tar['rows'])} records, {len(rejects)} rejects, {tar['bytes']} bytes")
+
+    def _attempt(self, item: Item) -> Outcome:
+        """The item's records, its reject or its failure, with a line in the log.
+
+        What a person must mend is raised, and what a disk did, because no item is to blame.
+        """
+        self._watch.start()
+        outcome: Outcome
+        try:
+            taken_over = self._take_over(item)
+            outcome, source = taken_over if taken_over is not None else (self._compute(item), "")
+        except UserError:
+            raise
+        except Exception as error:
+            if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
+                raise
+            outcome, source = _Failure(traceback.format_exc()), ""
+        text = f"{len(outcome)} record(s)" if isinstance(outcome, list) else str(outcome)
+        text = f"rejected, {text}" if isinstance(outcome, Reject) else text
+        self.say(f"{item.id}: {self._watch}, {text}{source}")
+        return outcome
+
+    def _take_over(self, item: Item) -> tuple[Outcome, str] | None:
+        """What an earlier try or artifact holds of the item, and the words for the log that say which.
+
+        None where there is nothing, or where it is damaged: then the item is computed.
+        """
+        rows, reuse = self._kept.get(item.id), self._task.reuse.get(item.id)
+        try:
+            if rows is not None:
+                return [self._draft.read_row(row) for row in rows], ", taken over from before"
+            if reuse is None:
+                return None
+            if reuse.reject is not None:
+                return Reject(reuse.reject["reason"], reuse.reject["detail"]), ", taken over"
+            assert reuse.artifact is not None
+            artifact = _artifact(reuse.artifact)
+            return [artifact.read(record) for record in reuse.records], f", taken over from {reuse.artifact.name}"
+        except Damaged as error:  # of an artifact that this one does not depend on, or of an unfinished part
+            self.say(f"{item.id}: not taken over: {error}")
+            return None
+
+    def _compute(self, item: Item) -> list[Record] | Reject:
+        """What the stage makes of the item."""
+        task = self._task
         if (task.stage, task.key) not in _opened:  # paid once per process, by no item: imports, what the stage loads
             _announce(task, None)
             _open(task)
-            say(f"{task.stage} opened: {watch}")
-            watch.start()
+            self.say(f"{task.stage} opened: {self._watch}")
+            self._watch.start()
         _announce(task, item.id)
         stage, worker = _open(task)
         try:
@@ -198,94 +318,6 @@ def _run_part(task: PartTask, draft: Draft) -> PartResult:
         if not records:
             raise AssertionError(f"{task.stage} made no record of item {item.id!r} and did not reject it")
         return records
-
-    def taken_over(read: Callable[[], list[Record]], item: Item) -> list[Record] | Reject:
-        try:
-            return read()
-        except Damaged as error:  # of an artifact that this one does not depend on, or of an unfinished part
-            say(f"{item.id}: not taken over: {error}")
-            return compute(item)
-
-    def attempt(item: Item) -> list[Record] | Reject | _Failure:
-        watch.start()
-        reuse = task.reuse.get(item.id)
-        try:
-            if item.id in kept:
-                result: list[Record] | Reject | _Failure = taken_over(
-                    lambda: [draft.read_row(row) for row in kept[item.id]], item
-                )
-            elif reuse is None:
-                result = compute(item)
-            elif reuse.reject is not None:
-                result = Reject(reuse.reject["reason"], reuse.reject["detail"])
-            else:
-                result = taken_over(lambda: [_artifact(reuse.artifact).read(record) for record in reuse.records], item)
-        except UserError:
-            raise
-        except Exception as error:
-            if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
-                raise
-            result = _Failure(traceback.format_exc())
-        what = f"{len(result)} record(s)" if isinstance(result, list) else f"rejected, {result}"
-        if isinstance(result, _Failure):
-            what = f"FAILED\n{result.trace.rstrip()}"
-        where = "" if reuse is None else ", taken over" + (f" from {reuse.artifact.name}" if reuse.artifact else "")
-        if item.id in kept:
-            where = ", taken over from before"
-        say(f"{item.id}: {watch}, {what}{where}")
-        return result
-
-    say(f"{len(task.items)} items of {task.stage} {task.group or '-'}: process {os.getpid()} on {socket.gethostname()}")
-    finished = draft.sound_markers({task.part_key: [item.id for item in task.items]})[0][task.part_key]
-    if finished is not None and not any(task.limits.exceed(reject) for reject in finished["rejects"]):
-        say("finished already, by a worker that died before it could say so")
-        return PartResult(task.part_key, Counter(reject["reason"] for reject in finished["rejects"]))
-    kept: dict[str, list[Row]] = {}
-    rejected = dict(task.killed)
-    # a part finished under lower limits, or one of which an item failed: what they lack is computed, the rest stays as it is
-    before = draft.marker(task.part_key, UNFINISHED if finished is None else FINISHED)
-    if before is not None:
-        for row in map(Row.from_json, before["rows"]):
-            kept.setdefault(row.item, []).append(row)
-        rejected = {reject["item"]: reject for reject in before["rejects"] if not task.limits.exceed(reject)} | rejected
-    writer = draft.open_part()
-    rejects: list[dict[str, Any]] = []
-    failed: list[tuple[str, str]] = []
-    try:
-        early = {item.id: attempt(item) for item in task.items if item.id == task.first}
-        for item, item_key in zip(task.items, task.item_keys, strict=True):
-            row = {"item": item.id, "group": item.group, "item_key": item_key}
-            if item.id in rejected:
-                rejects.append({**row, **rejected[item.id]})
-                continue
-            result = early.pop(item.id) if item.id in early else attempt(item)
-            if isinstance(result, _Failure):
-                failed.append((item.id, result.trace))
-            elif isinstance(result, Reject):
-                rejects.append({**row, "reason": result.reason, "detail": result.detail})
-            else:
-                for record in result:
-                    writer.add(record, item.id, item.group, item_key)
-        failed_items = {item for item, _ in failed}
-        marker = {
-            **writer.close(),
-            "part_key": task.part_key,
-            "group": task.group,
-            "items": [item.id for item in task.items if item.id not in failed_items],
-            "rejects": rejects,
-        }
-        if not failed:
-            draft.finish_part(task.part_key, marker)
-        elif marker["items"]:
-            draft.keep_unfinished(task.part_key, marker)
-        say(
-            f"{f'unfinished, {len(failed)} failed' if failed else 'finished'}: "
-            f"{len(marker['rows'])} records, {len(rejects)} rejects, {marker['bytes']} bytes"
-        )
-        return PartResult(task.part_key, Counter(reject["reason"] for reject in rejects), tuple(failed))
-    except BaseException:
-        writer.discard()
-        raise
 
 
 def _open(task: PartTask) -> tuple[MapStage, Any]:

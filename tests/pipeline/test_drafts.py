@@ -195,6 +195,28 @@ def test_a_damaged_unfinished_part_is_computed_again(run, tmp_path):
     assert len(computed) == 4 and artifacts["numbers"].digest == undisturbed(run, tmp_path, n=4)
 
 
+@pytest.mark.parametrize("source", ["unfinished part", "artifact"])
+def test_the_log_calls_nothing_taken_over_that_was_damaged_and_computed_again(run, tmp_path, source):
+    """A byte of n000's record changes. n002 lies beside it, and is sound."""
+    if source == "artifact":
+        run(numbers={"n": 6})
+        (part,) = (path for path in (tmp_path / "store").glob("toy/numbers/*/parts/*.tar") if b"n000." in path.read_bytes())
+    else:
+        with pytest.raises(ItemsFailed):
+            run(numbers={"n": 6, "fail": ["n001", "n003", "n004", "n005"]})
+        (part,) = (tmp_path / "store").glob("toy/numbers/*.partial/parts/*.tar")
+    data = bytearray(part.read_bytes())
+    data[512] ^= 1  # the first byte after the first member's header
+    part.write_bytes(data)
+    artifacts, _, computed = run(numbers={"n": 8 if source == "artifact" else 6})
+    lines = "".join(path.read_text() for path in (artifacts["numbers"].path / "logs").iterdir()).splitlines()
+    first, last = (line.partition("n000: ")[2] for line in [line for line in lines if "n000: " in line][-2:])
+    assert "n000" in computed and "n002" not in computed
+    assert first.startswith("not taken over: ") and last.endswith("1 record(s)")
+    where = "from before" if source == "unfinished part" else "from v1-"
+    assert f"1 record(s), taken over {where}" in [line for line in lines if "n002: " in line][-1]
+
+
 def test_an_item_that_exceeded_a_limit_in_an_unfinished_part_is_tried_under_a_higher_one(run, tmp_path):
     with pytest.raises(ItemsFailed):
         run(workers=1, numbers={"n": 8, "fail": ["n000"], "sleep": ["n002"], "limits": {"wall_s": 0.5}})
