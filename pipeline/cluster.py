@@ -204,11 +204,11 @@ class Cluster:
             from distributed.diagnostics.plugin import WorkerPlugin
         except ModuleNotFoundError:
             raise UserError("executor=dask needs Dask: pip install 'lightmill[dask]'") from None
-        where: Any = config.address
+        scheduler: Any = config.address
         if config.cluster is not None:
-            where = self._stack.enter_context(self._start(config.cluster))
+            scheduler = self._stack.enter_context(self._start(config.cluster))
         try:
-            client = self._stack.enter_context(distributed.Client(where, timeout=CONNECT))
+            client = self._stack.enter_context(distributed.Client(scheduler, timeout=CONNECT))
         except (OSError, ValueError) as error:
             raise UserError(f"no Dask scheduler answers at executor.address={config.address}: {error}") from None
         guard = type("Guard", (_Guard, WorkerPlugin), {})(self._guard, config.threads)

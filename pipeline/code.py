@@ -54,14 +54,14 @@ def _tree(path: Path) -> ast.Module:
 
 def imported_modules(name: str, roots: tuple[Path, ...] = (ROOT,)) -> set[str]:
     """Project modules (not the engine's) that ``name`` imports anywhere in it, functions included, and theirs in turn."""
-    found: set[str] = set()
+    modules: set[str] = set()
     todo = [name]
     while todo:
         module = todo.pop()
         path = _module_file(module, roots)
-        if path is None or module in found or module.split(".")[0] == ENGINE:
+        if path is None or module in modules or module.split(".")[0] == ENGINE:
             continue
-        found.add(module)
+        modules.add(module)
         for node in ast.walk(_tree(path)):
             if isinstance(node, ast.Import):
                 todo += [alias.name for alias in node.names]
@@ -72,7 +72,7 @@ def imported_modules(name: str, roots: tuple[Path, ...] = (ROOT,)) -> set[str]:
                     package = package[: len(package) - node.level + 1]
                     base = ".".join([*package, base]) if base else ".".join(package)
                 todo += [base, *(f"{base}.{alias.name}" for alias in node.names)]
-    return found
+    return modules
 
 
 def code_digest(system: System, stage: str) -> str:

@@ -47,9 +47,9 @@ def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     lines = []
     for name in sorted(before.keys() | after.keys()):
         if before.get(name, "absent") != after.get(name, "absent"):
-            shown = name.replace("params.", f"{new['stage']}.", 1)
+            parameter = name.replace("params.", f"{new['stage']}.", 1)
             a, b = (_short(side.get(name, "absent")) for side in (before, after))
-            lines.append(f"{shown}: {a} -> {b}")
+            lines.append(f"{parameter}: {a} -> {b}")
     return lines
 
 
@@ -65,17 +65,17 @@ def _places(store: Store, reference: str | None) -> list[str | None]:
 
 def command_ls(store: Store, arguments: argparse.Namespace) -> int:
     places = _places(store, arguments.stage)
-    artifacts = [artifact for where in places for artifact in store.artifacts(where)]
+    artifacts = [artifact for place in places for artifact in store.artifacts(place)]
     print_table((_list_row(store, artifact) for artifact in artifacts), right=(1, 2, 3))
     for path in store.drafts():
-        where = store.place_of(path)
-        if None in places or where in places:
-            holder = store.claim(where, path.name.removesuffix(".partial")).holder()
+        place = store.place_of(path)
+        if None in places or place in places:
+            holder = store.claim(place, path.name.removesuffix(".partial")).holder()
             state = f"in the making by process {holder['pid']} on {holder['host']}" if holder else "unfinished"
             parts = len(list((path / "markers").glob("[!.]*.json")))
-            print(f"{where}/{path.name[:12]}.partial  {parts} parts, {state}")
+            print(f"{place}/{path.name[:12]}.partial  {parts} parts, {state}")
     readable = {artifact.path for artifact in artifacts}
-    for path in (path for where in places for path in store.folders(where)):
+    for path in (path for place in places for path in store.folders(place)):
         if path not in readable:
             name = f"{store.place_of(path)}/{path.name:<30}"
             print(f"{name} damaged: `lightmill verify` says how, `lightmill repair` makes it anew")
@@ -134,11 +134,11 @@ def command_show(store: Store, arguments: argparse.Namespace) -> int:
 
 def _summary(name: str, value: Any) -> None:
     """A group of plain values, such as a distribution, is one line."""
-    shown = name.removeprefix("summary.")
+    label = name.removeprefix("summary.")
     if not isinstance(value, Mapping):
-        print(f"  summary   {shown} = {value}")
+        print(f"  summary   {label} = {value}")
     elif not any(isinstance(item, Mapping) for item in value.values()):
-        print(f"  summary   {shown}: " + (", ".join(f"{key} {value[key]}" for key in sorted(value, key=_natural)) or "none"))
+        print(f"  summary   {label}: " + (", ".join(f"{key} {value[key]}" for key in sorted(value, key=_natural)) or "none"))
     else:
         for key in sorted(value, key=_natural):
             _summary(f"{name}.{key}", value[key])
@@ -152,8 +152,8 @@ def _natural(name: str) -> list[tuple[bool, int, str]]:
 def _lineage(store: Store, artifact: Artifact, indent: str, seen: set[str]) -> None:
     for name, key, parent in iter_inputs(store, artifact):
         again = " (above)" if key in seen and parent is not None else ""
-        what = parent.name if parent is not None else f"{name}/{key[:12]} (gone)"
-        print(f"{indent}{what}{again}")
+        line = parent.name if parent is not None else f"{name}/{key[:12]} (gone)"
+        print(f"{indent}{line}{again}")
         if parent is not None and not again:
             seen.add(key)
             _lineage(store, parent, indent + "  ", seen)
@@ -236,7 +236,7 @@ def _explain(
 
 
 def command_status(store: Store, arguments: argparse.Namespace) -> int:
-    states = [state for where in _places(store, arguments.stage) for state in read_states(store, where)]
+    states = [state for place in _places(store, arguments.stage) for state in read_states(store, place)]
     if arguments.json:
         print(json.dumps(states, indent=1))
         return 0
@@ -263,8 +263,8 @@ def command_verify(store: Store, arguments: argparse.Namespace) -> int:
         print(f"{name}: {'sound' if not problems else f'{len(problems)} problem(s); lightmill repair {name} makes it anew'}")
         for problem in problems:
             print(f"  {problem}")
-    how = "every byte read" if arguments.deep else "sizes and listings; --deep reads every byte"
-    print(f"{len(artifacts) - bad} of {len(artifacts)} artifacts sound ({how})")
+    depth = "every byte read" if arguments.deep else "sizes and listings; --deep reads every byte"
+    print(f"{len(artifacts) - bad} of {len(artifacts)} artifacts sound ({depth})")
     return Damaged.status if bad else 0
 
 
@@ -275,9 +275,9 @@ def command_repair(store: Store, arguments: argparse.Namespace) -> int:
 
 
 def command_gc(store: Store, arguments: argparse.Namespace) -> int:
-    found = store.garbage(arguments.days)
+    garbage = store.garbage(arguments.days)
     total = 0
-    for path, reason in found:
+    for path, reason in garbage:
         count = _bytes(path)
         print(f"{'deleting' if arguments.delete else 'would delete'} {path.relative_to(store.root)}  {size(count)}  {reason}")
         if arguments.delete and not store.remove(path, arguments.days):
@@ -285,7 +285,7 @@ def command_gc(store: Store, arguments: argparse.Namespace) -> int:
             count = 0
         total += count
     verb = "freed" if arguments.delete else "to free; nothing was deleted, add --delete"
-    print(f"{len(found)} entries, {size(total)} {verb}")
+    print(f"{len(garbage)} entries, {size(total)} {verb}")
     return 0
 
 

@@ -109,8 +109,8 @@ def parse(kind: Any, data: Any, where: str) -> Any:
             elif problem["type"] == "missing":
                 lines.append(f"{path} is needed")
             else:
-                given = "" if isinstance(problem.get("input"), dict) else f"={problem.get('input')!r}"  # what names itself
-                lines.append(f"{path}{given}: {problem['msg'].removeprefix('Value error, ')}")
+                value = "" if isinstance(problem.get("input"), dict) else f"={problem.get('input')!r}"  # what names itself
+                lines.append(f"{path}{value}: {problem['msg'].removeprefix('Value error, ')}")
         raise UserError("; ".join(lines)) from None
 
 

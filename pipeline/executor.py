@@ -207,11 +207,11 @@ def _after_death(
         return task
     item = state["item"]
     verdict = verdict or {"reason": "crash", "detail": f"worker died with exit code {death.exitcode}"}
-    what = f"{item}: {verdict['detail']}; "
-    what += f"rejected as {verdict['reason']}" if task.first == item else "trying it once more, alone"
-    log(f"{task.stage}: {what}")
+    message = f"{item}: {verdict['detail']}; "
+    message += f"rejected as {verdict['reason']}" if task.first == item else "trying it once more, alone"
+    log(f"{task.stage}: {message}")
     with contextlib.suppress(OSError):
-        write_log(task.draft, task.part_key, what)
+        write_log(task.draft, task.part_key, message)
     if task.first != item:
         return dataclasses.replace(task, first=item)
     killed = {**task.killed, item: {**verdict, "machine": True}}

@@ -1,8 +1,8 @@
 """Keys: what an artifact *is*, as a hash known before anything runs.
 
 key = blake2b-256 of canonical JSON {scheme, system, stage, version, params, inputs: {role: key}}; the legacy system is left
-out. Inputs enter by key, not by
-content, so plans and sweeps know every key up front and nothing relies on bit-reproducible GPUs.
+out. Inputs enter by key, not by content. So plans and sweeps know every key up front, and nothing relies on bit-reproducible
+GPUs.
 """
 
 from __future__ import annotations

@@ -28,13 +28,14 @@ from pipeline.store import DRAFT, SCHEMA, Artifact, Claim, Draft, Store
 
 
 def machine_rejects(artifact: Artifact | None) -> list[dict[str, Any]]:
-    """Rejects of the artifact that are the machine's doing; its listing is read only where there may be any."""
-    if artifact is None or not artifact.manifest["outputs"]["rejects"].keys() & set(REASONS):
+    """Rejects of the artifact that are the machine's doing: items that crashed or hit a limit."""
+    if artifact is None or not artifact.manifest["outputs"]["rejects"].keys() & set(REASONS):  # spares reading the listing
         return []
     return [reject for reject in artifact.rejects() if reject.get("machine")]
 
 
 def describe(artifact: Artifact) -> str:
+    """The artifact's name and its numbers of records and rejects, for a line of the run."""
     outputs = artifact.manifest["outputs"]
     text = artifact.name
     if outputs["items"]:
@@ -220,7 +221,7 @@ def _digest_of(store: Store, stage: str, key: str) -> str | None:
 
 
 def machine(packages: Iterable[str]) -> dict[str, Any]:
-    """Where an artifact was made: Python, the named packages, the GPU and its driver."""
+    """The machine at work, for the manifest: platform, Python, versions of ``packages`` (None if missing), GPUs and driver."""
     versions = {}
     for package in packages:
         try:

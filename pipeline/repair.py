@@ -1,9 +1,10 @@
 """Mending a damaged artifact: ``lightmill repair``.
 
-A draft of the same key takes over every part that can be shown to be sound, the others are computed as in any interrupted
-run, and the result is swapped in; the damaged artifact goes to the trash. Rows are believed only where the bytes of their part
-bear them out, so any file of the artifact may be the damaged one: what it takes to compute is in the manifest and again in
-``draft.json``, and one of the two must be sound.
+A draft of the same key takes over every part that is sound. The others are computed, as in any interrupted run. Then the result
+is swapped in, and the damaged artifact goes to the trash.
+
+A row counts only if its part's bytes match it. So any file of the artifact may be the damaged one. What it takes to compute is
+in the manifest and again in ``draft.json``. One of the two must be sound.
 """
 
 from __future__ import annotations
@@ -29,7 +30,10 @@ from pipeline.worker import log_file
 
 
 def repair(store: Store, artifact: Artifact, workers: int | None = None, out: Callable[[str], None] = print) -> Artifact:
-    """Compute the damaged parts of the artifact anew and swap the mended one in; returns it."""
+    """Compute the damaged parts of the artifact anew, swap the mended artifact in, and return it.
+
+    UserError where an input is gone or the key would be another; Damaged where nothing says soundly how it was made.
+    """
     name = artifact.name
     problems = artifact.verify(deep=True)
     if not problems:
@@ -85,7 +89,7 @@ def _manifest(artifact: Artifact) -> dict[str, Any]:
 
 
 def _codes(artifact: Artifact) -> list[str]:
-    """Digests of the code that made it, from whichever copy is sound."""
+    """Code digests behind the artifact, from whichever copy is sound."""
     return artifact.codes if _manifest(artifact) else (read_draft(artifact.path) or {}).get("codes", [UNKNOWN])
 
 
@@ -122,9 +126,9 @@ def _planned(store: Store, name: str, origin: Mapping[str, Any]) -> Planned:
 
 
 def sound_parts(artifact: Artifact) -> Iterator[dict[str, Any]]:
-    """Markers of the parts whose tar, rows and rejects are what was written, whatever else is damaged."""
+    """Markers of the sound parts: their tar, rows and rejects are as they were written, whatever else is damaged."""
     outputs = _manifest(artifact).get("outputs")
-    told = {part["digest"]: part for part in outputs["parts"]} if outputs else {}
+    manifest_parts = {part["digest"]: part for part in outputs["parts"]} if outputs else {}
     rejects: dict[str, dict[str, Any]] = {}
     if outputs:  # without, rejects cannot be checked, and parts that had any are computed again
         with contextlib.suppress(Damaged):
@@ -143,8 +147,8 @@ def sound_parts(artifact: Artifact) -> Iterator[dict[str, Any]]:
         if outputs is None:
             items = sorted({row.item for row in rows})
             yield from checked({"digest": digest, "group": rows[0].group, "items": items}, rows)
-        elif digest in told:
-            yield from checked(told[digest], rows)
+        elif digest in manifest_parts:
+            yield from checked(manifest_parts[digest], rows)
     for part in outputs["empty_parts"] if outputs else ():
         yield from checked({**part, "digest": None, "bytes": 0}, [])
 
@@ -152,7 +156,7 @@ def sound_parts(artifact: Artifact) -> Iterator[dict[str, Any]]:
 def _part(
     artifact: Artifact, part: Mapping[str, Any], items: list[tuple[str, str]], rows: list[Row], rejects: list[dict[str, Any]]
 ) -> Iterator[dict[str, Any]]:
-    """The part's marker, if it is sound: its key is the hash of its items', its rows say what the tar holds."""
+    """The part's marker, if the part is sound: its key is the hash of its items' keys, and its rows say what its tar holds."""
     part_key = digest_of({"group": part["group"], "items": [key for _, key in items]})
     if part.get("part_key", part_key) != part_key or any(row.group != part["group"] for row in rows):
         return
@@ -178,11 +182,11 @@ def _part(
 
 
 def _rows_match(path: Path, rows: list[Row]) -> bool:
-    """Whether the rows say what the tar holds: its members, all of them, and the digests of its records."""
+    """Whether the rows name all members of the tar, and no other, and the digests of its records."""
     with tarfile.open(path) as tar:
-        held = {member.name: (member.offset_data, member.size) for member in tar.getmembers()}
-    told = {f"{row.id}.{name}": place for row in rows for name, place in row.members.items()}
-    if held != told or sum(len(row.members) for row in rows) != len(held):
+        tar_members = {member.name: (member.offset_data, member.size) for member in tar.getmembers()}
+    listed_members = {f"{row.id}.{name}": place for row in rows for name, place in row.members.items()}
+    if tar_members != listed_members or sum(len(row.members) for row in rows) != len(tar_members):
         return False
     with open(path, "rb") as file:
         for row in rows:
@@ -196,7 +200,7 @@ def _rows_match(path: Path, rows: list[Row]) -> bool:
 
 
 def _rows(path: Path) -> Iterator[Row]:
-    """The lines of the listing that are still rows, as far as it can be read."""
+    """The rows of a listing as far as it can be read. Lines that are none any more are left out."""
     with contextlib.suppress(OSError), open(path, "rb") as file:
         for line in file:
             try:

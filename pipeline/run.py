@@ -149,7 +149,7 @@ def _todo(run: RunConfig, plan: Mapping[str, Planned], artifacts: Mapping[str, A
 
 
 def _note_rejects(artifact: Artifact, command: Sequence[str]) -> Iterator[str]:
-    """Says of machine rejects what to do: an undisturbed run would have made records of them."""
+    """Lines that say how to try machine rejects again: an undisturbed run would have made records of them."""
     try:
         rejects = machine_rejects(artifact)
     except Damaged:  # nobody reads it now
@@ -158,11 +158,11 @@ def _note_rejects(artifact: Artifact, command: Sequence[str]) -> Iterator[str]:
         name = artifact.stage
         counts = Counter(reject["reason"] for reject in rejects)
         listed = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
-        met: dict[str, float] = {}
+        highest: dict[str, float] = {}  # limit -> the highest that an item ran into
         for reject in rejects:
             for limit, value in reject.get("limit", {}).items():
-                met[limit] = max(value, met.get(limit, 0.0))
-        raised = "".join(f", {name}.limits.{limit}=N allows more than {value:g}" for limit, value in sorted(met.items()))
+                highest[limit] = max(value, highest.get(limit, 0.0))
+        raised = "".join(f", {name}.limits.{limit}=N allows more than {value:g}" for limit, value in sorted(highest.items()))
         yield f"   note: the machine rejected {len(rejects)} of its items ({listed})"
         again = [word for word in command if word != "plan=true"]
         yield f"   note: to try them again: {shlex.join([*again, f'retry={name}'])}{raised}"

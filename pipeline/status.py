@@ -47,11 +47,13 @@ class RunState:
             temporary.write_text(json.dumps({**self._facts, "seconds": round(elapsed, 3)}))
 
     def add_rejects(self, rejects: Mapping[str, int]) -> None:
+        """Add numbers of rejects by reason."""
         counts = self._facts["rejects"]
         for reason, count in rejects.items():
             counts[reason] = counts.get(reason, 0) + count
 
     def add_failure(self, item: str, trace: str, log: Path) -> None:
+        """Name an item that raised. Only the first ``MAX_FAILURES`` are named."""
         if len(self._facts["failures"]) < MAX_FAILURES:
             last = trace.strip().splitlines()[-1]
             self._facts["failures"].append({"item": item, "error": last, "log": f"logs/{log.name}"})
@@ -66,14 +68,14 @@ def read_states(store: Store, place: str | None = None) -> list[dict[str, Any]]:
 
     ``state``: running (``items``: which process is at what, and for how long), stopped (``message`` says why) or dead.
     """
-    found = []
+    states = []
     for path in store.drafts():
-        where = store.place_of(path)
-        if place not in (None, where):
+        draft_place = store.place_of(path)
+        if place not in (None, draft_place):
             continue
         key = path.name.removesuffix(".partial")
         facts = _read(path / "running" / RUN)
-        holder = store.claim(where, key).holder()
+        holder = store.claim(draft_place, key).holder()
         state = "running" if holder else "stopped" if "status" in facts else "dead"
         marked = list((path / "markers").glob("[!.]*.json"))
         items = []
@@ -84,12 +86,12 @@ def read_states(store: Store, place: str | None = None) -> list[dict[str, Any]]:
                     seconds = round(time.time() - item["time"], 1)
                     items.append({"item": item["item"] or "opening", "pid": item["pid"], "seconds": seconds})
         changed = max([file.stat().st_mtime for file in (path / "markers", path / "running") if file.exists()], default=0.0)
-        found.append(
-            {**facts, "stage": path.parent.name, "place": where,
+        states.append(
+            {**facts, "stage": path.parent.name, "place": draft_place,
              "key": key, "state": state, "holder": holder, "parts_done": len(marked),
              "items": items, "changed": changed, "path": str(path)}
         )  # fmt: skip
-    return sorted(found, key=lambda state: state["changed"])
+    return sorted(states, key=lambda state: state["changed"])
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -103,12 +105,12 @@ def lines(state: Mapping[str, Any]) -> list[str]:
     """A draft's state for people."""
     clock = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(state["changed"]))
     holder = state["holder"] or {}
-    what = {
+    headline = {
         "running": f"running, process {holder.get('pid')} on {holder.get('host')}",
         "stopped": f"stopped with status {state.get('status')} at {clock}",
         "dead": f"not running: its process ended without a word (killed?), last sign {clock}",
     }[state["state"]]
-    out = [f"{state['place']}/{state['key'][:12]}.partial  {what}"]
+    out = [f"{state['place']}/{state['key'][:12]}.partial  {headline}"]
 
     def add(name: str, text: str) -> None:
         out.append(f"  {name:<9} {text}")

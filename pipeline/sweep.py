@@ -35,7 +35,7 @@ LAUNCHER = "hydra/launcher="
 
 @dataclass(frozen=True)
 class Job:
-    """One combination of the overrides: its words, the composed config as plain containers, and what it would make."""
+    """One combination of the overrides: its words, the composed config as plain containers, and its plan."""
 
     words: tuple[str, ...]
     root: Mapping[str, Any]
@@ -109,7 +109,7 @@ def label(job: Job, jobs: Sequence[Job]) -> str:
 
 
 def run_in_turn(jobs: Sequence[Job], command: Sequence[str], out: Callable[[str], None]) -> dict[str, int]:
-    """Run the jobs in this process; returns the exit status of each. One that fails is told, and the next one runs."""
+    """Run the jobs in this process; returns the exit status of each by name. After one that fails the next one runs."""
     statuses = {}
     for job in jobs:
         out(f"== {job.name}")
@@ -149,30 +149,39 @@ def run_side_by_side(jobs: Sequence[Job], at_once: int, command: Sequence[str], 
             run_plan(job.run_plan, command, say)
             return 0
         root = {**job.root, "workers": cores if job.root["workers"] == "auto" else job.root["workers"]}
+        message = {"name": job.name, "root": root, "keys": job.keys, "command": list(command)}
         environment = free.get()
         try:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "pipeline.job"],
-                env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-            )  # fmt: skip
-            assert process.stdin is not None and process.stdout is not None
-            try:
-                json.dump({"name": job.name, "root": root, "keys": job.keys, "command": list(command)}, process.stdin)
-                process.stdin.close()
-            except BrokenPipeError:  # it died before it could read: its status says how
-                pass
-            for line in process.stdout:
-                say(line.rstrip("\n"))
-            status = process.wait()
+            return _run_process(message, environment, say)
         finally:
             free.put(environment)
-        return status if status >= 0 else 128 - status  # killed by a signal: the shells' number
 
     pool = ThreadPoolExecutor(at_once)
     try:
         return dict(zip(names.values(), pool.map(run, jobs), strict=True))
     finally:  # after Ctrl-C, which the running jobs get too, none starts any more
         pool.shutdown(cancel_futures=True)
+
+
+def _run_process(message: Mapping[str, Any], environment: Mapping[str, str], say: Callable[[str], None]) -> int:
+    """Run a job in a process of its own and hand on its lines; returns its exit status.
+
+    ``message``: what ``pipeline.job`` reads. ``environment``: the process's variables.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pipeline.job"],
+        env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    assert process.stdin is not None and process.stdout is not None
+    try:
+        json.dump(message, process.stdin)
+        process.stdin.close()
+    except BrokenPipeError:  # it died before it could read: its status says how
+        pass
+    for line in process.stdout:
+        say(line.rstrip("\n"))
+    status = process.wait()
+    return status if status >= 0 else 128 - status  # killed by a signal: the shells' number
 
 
 def deal(gpus: Sequence[str], at_once: int) -> list[list[str] | None]:
@@ -185,6 +194,7 @@ def deal(gpus: Sequence[str], at_once: int) -> list[list[str] | None]:
 
 
 def _complete(job: Job) -> bool:
+    """Whether the job has nothing to make."""
     run = job.run_plan.run
     store = Store(run.store)
     planned = [job.plan[name] for name in run.stage]
@@ -196,12 +206,12 @@ def _make_shared(job: Job, shared: Mapping[str, str], command: Sequence[str], ou
     plan = plan_again(job.name, job.root, job.keys)
     run = plan.run
     for setting, names in (("force", run.force), ("retry", run.retry)):
-        if ours := [name for name in names if name in shared]:
+        if again := [name for name in names if name in shared]:
             raise UserError(
-                f"{setting}={','.join(ours)}: all jobs of the sweep share it; do that by itself, then run the sweep"
+                f"{setting}={','.join(again)}: all jobs of the sweep share it; do that by itself, then run the sweep"
             )
-    read = {parent for name in shared for parent in job.plan[name].parents.values()}
-    targets = tuple(name for name in shared if name not in read)
+    parents = {parent for name in shared for parent in job.plan[name].parents.values()}
+    targets = tuple(name for name in shared if name not in parents)
     run = run.model_copy(update={"stage": targets, "force": (), "retry": ()})
     run_plan(replace(plan, run=run, stages={name: plan.stages[name] for name in shared}), command, out)
 

@@ -73,7 +73,7 @@ class PartTask:
 
 @dataclass(frozen=True)
 class PartResult:
-    """What the runner hears of a part: rejects by reason; ``failed`` holds (item id, traceback) of ordinary exceptions."""
+    """What the runner hears of a part: numbers of rejects by reason, and (item id, traceback) of each item that raised."""
 
     part_key: str
     rejects: Mapping[str, int] = field(default_factory=dict)
@@ -96,10 +96,12 @@ def die_with_parent() -> None:
 
 
 def running_file(draft: Path, part_key: str) -> Path:
+    """Where the part's worker says what it is at."""
     return draft / "running" / f"{part_key}.json"
 
 
 def log_file(draft: Path, part_key: str) -> Path:
+    """The part's log, in a draft or an artifact."""
     return draft / "logs" / f"{part_key[:16]}.log"
 
 

@@ -29,7 +29,7 @@ def place(preimage: Mapping[str, Any]) -> str:
 
 
 def is_sound(path: Path, digest: str) -> bool:
-    """Whether the file is there, can be read and has that digest."""
+    """Whether the file exists, can be read and has that digest."""
     try:
         return hash_file(path) == digest
     except OSError:
@@ -87,7 +87,7 @@ class Records:
         return self.read_row(self.row(record_id), only)
 
     def read_row(self, row: Row, only: Collection[str] | None = None) -> Record:
-        """The record that the row tells the place of."""
+        """The record of the row. Damaged where its bytes are gone, cut or changed."""
         path = self.part_path(row.part)
         try:
             with open(path, "rb") as file:
@@ -146,12 +146,12 @@ class Artifact(Records):
 
     @property
     def place(self) -> str:
-        """Where it lies in the store, from what it says of itself; from its path where it is too damaged to say."""
+        """The folder in the store that its manifest implies. Where that is damaged, the folder that it lies in."""
         try:
-            about: Mapping[str, Any] | None = self.manifest
+            origin: Mapping[str, Any] | None = self.manifest
         except Damaged:
-            about = read_draft(self.path)
-        return self.path.parent.name if about is None else place(about["preimage"])
+            origin = read_draft(self.path)
+        return self.path.parent.name if origin is None else place(origin["preimage"])
 
     @property
     def name(self) -> str:
@@ -160,7 +160,7 @@ class Artifact(Records):
 
     @property
     def codes(self) -> list[str]:
-        """Digests of the code that made it: first that of the run that ended it, then others whose parts that took over."""
+        """Code digests behind this artifact. The first is the run that committed it; the rest made parts that it reused."""
         code = self.manifest["code"]
         return [code["digest"], *code.get("others", [])]
 
@@ -191,14 +191,14 @@ class Artifact(Records):
         return path
 
     def _trouble(self, name: str, size: int | None, digest: str | None, items: int | None = None) -> str:
-        """What is wrong with one file, empty if nothing is; None: not looked at."""
+        """What is wrong with one file, empty if nothing is. ``size`` and ``digest`` are not compared where they are None."""
         path = self.path / name
         try:
             if not path.is_file():
                 return f"{name} is missing" + (f" ({items} items)" if items is not None else "")
-            found = path.stat().st_size
-            if size is not None and found != size:
-                return f"{name} has {found} bytes, not {size}"
+            actual_size = path.stat().st_size
+            if size is not None and actual_size != size:
+                return f"{name} has {actual_size} bytes, not {size}"
             if digest is not None and hash_file(path) != digest:
                 return f"{name} does not hash to {'its name' if digest in name else digest[:12]}"
         except OSError as error:
@@ -228,7 +228,7 @@ class Artifact(Records):
 
 
 def read_draft(folder: Path) -> dict[str, Any] | None:
-    """What is, or was, being made in the folder: key, preimage, system, config, environment. None if missing or damaged."""
+    """The folder's ``draft.json``: key, preimage, system, config, environment. None if it is missing or damaged."""
     try:
         return read_sealed(folder / DRAFT)
     except (OSError, ValueError):

@@ -93,6 +93,7 @@ class Claim:
             return False
 
     def release(self) -> None:
+        """Let go of it, if this process holds it."""
         self._stop.set()
         if self._handle is not None:
             if self._is_at_path(self._handle):

@@ -75,11 +75,13 @@ class Draft(Records):
                 path.unlink(missing_ok=True)
 
     def describe(self, **facts: Any) -> None:
+        """Set entries of ``draft.json``."""
         write_sealed(self.path / DRAFT, {**(read_draft(self.path) or {}), **facts})
 
     # -- environment: runtime choices that one artifact must not mix
 
     def environment(self) -> dict[str, Any] | None:
+        """The runtime choices that it was begun with; None before there are any."""
         return (read_draft(self.path) or {}).get("environment")
 
     def set_environment(self, environment: Mapping[str, Any]) -> None:
@@ -88,16 +90,17 @@ class Draft(Records):
     # -- code: digests of all that made what is in here; one artifact may mix them, and its manifest says so
 
     def codes(self) -> list[str]:
+        """Code digests behind what is finished, the code at work among them."""
         return (read_draft(self.path) or {}).get("codes", [UNKNOWN])
 
     def made_by(self, codes: Iterable[str], what: str) -> None:
-        """Remember who made ``what``, which the draft takes over."""
-        known = self.codes()
-        new = sorted(set(codes) - set(known))
+        """Add digests of code whose parts the draft takes over. ``what`` begins the note to a person: "what is sound was"."""
+        noted_codes = self.codes()
+        new = sorted(set(codes) - set(noted_codes))
         if new:
-            self.describe(codes=known + new)
-            whose = "code that nobody noted" if new == [UNKNOWN] else "other code of the same version"
-            self.log(f"   note: {what} made by {whose}")
+            self.describe(codes=noted_codes + new)
+            maker = "code that nobody noted" if new == [UNKNOWN] else "other code of the same version"
+            self.log(f"   note: {what} made by {maker}")
 
     # -- parts
 
@@ -116,10 +119,11 @@ class Draft(Records):
             return None
 
     def sound_markers(self, parts: Mapping[str, list[str]]) -> tuple[dict[str, dict[str, Any] | None], int]:
-        """Of ``parts``, part key -> ids of its items: part key -> marker (less its rows) or None, with every byte read; and how
-        many parts turned out damaged. A marker of other items does not count.
+        """The markers of finished parts, without their rows, and the number of damaged parts.
 
-        What an interrupted run left may have lain for weeks; hashing runs at the disk's speed, computing again does not.
+        ``parts``: part key -> ids of its items. The result maps each part key to its marker, or to None. A marker of other
+        items does not count. Every byte is read, because an interrupted run may have lain for weeks, and hashing runs at the
+        disk's speed.
         """
 
         def check(part_key: str) -> tuple[dict[str, Any] | None, bool]:
@@ -133,8 +137,8 @@ class Draft(Records):
             return None, True
 
         with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as threads:
-            found = dict(zip(parts, threads.map(check, parts), strict=True))
-        return {key: marker for key, (marker, _) in found.items()}, sum(damaged for _, damaged in found.values())
+            checks = dict(zip(parts, threads.map(check, parts), strict=True))
+        return {key: marker for key, (marker, _) in checks.items()}, sum(damaged for _, damaged in checks.values())
 
     def unfinished_parts(self) -> dict[str, dict[str, Any]]:
         """Part key -> marker (less its rows) of each part of which an item failed; ``items`` are those that are done.
@@ -178,7 +182,7 @@ class Draft(Records):
             target = self.part_path(marker["digest"])
             if not is_sound(source, marker["digest"]):
                 return False
-            if not target.exists() or not target.samefile(source):  # of what lies there already nobody knows that it is sound
+            if not target.exists() or not target.samefile(source):  # a file of that name may be damaged
                 temporary = target.with_name(f".{uuid.uuid4().hex[:8]}.tmp")
                 try:
                     os.link(source, temporary)

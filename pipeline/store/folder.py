@@ -52,7 +52,7 @@ class Store:
     def _glob(self, name: str, place: str | None = None) -> list[Path]:
         """Folders of that name at the place, or at all of them: ``STAGE`` and ``SYSTEM/STAGE``."""
         places = PLACES if place is None else (place,)
-        return sorted(path for where in places for path in self.root.glob(f"{where}/{name}"))
+        return sorted(path for folder in places for path in self.root.glob(f"{folder}/{name}"))
 
     def place_of(self, path: Path) -> str:
         """The place of an artifact or draft of this store."""
@@ -83,8 +83,8 @@ class Store:
         places = sorted({self.place_of(path) for path in (*self.folders(), *self.drafts())})
         if reference is None or reference in places:
             return places if reference is None else [reference]
-        of_system = [where for where in places if where.startswith(f"{reference}/")]
-        return of_system or [where for where in places if where.endswith(f"/{reference}")]
+        of_system = [name for name in places if name.startswith(f"{reference}/")]
+        return of_system or [name for name in places if name.endswith(f"/{reference}")]
 
     def resolve(self, reference: str) -> Artifact:
         """The artifact that a person means: a key or its beginning, ``stage/folder``, a folder, or a stage's newest.
@@ -103,11 +103,11 @@ class Store:
             return newest[-1]
         token = rest.rpartition("-")[2]
         folders = [path for place in self.places(where) for path in self.folders(place)] if where else self.folders()
-        found = [Artifact(path) for path in folders if len(token) >= 4 and self._is_key(token, path)]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            raise UserError(f"{reference!r} is the beginning of {len(found)} keys: give more letters")
+        matches = [Artifact(path) for path in folders if len(token) >= 4 and self._is_key(token, path)]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            raise UserError(f"{reference!r} is the beginning of {len(matches)} keys: give more letters")
         raise UserError(f"no artifact {reference!r} in {self.root}: `lightmill ls` lists what is there")
 
     @staticmethod
@@ -147,8 +147,8 @@ class Store:
         about = {"key": key, "preimage": draft.preimage, "started": time.time(), **(origin or {})} if before is None else before
         others = [other for other in about.get("codes", [UNKNOWN]) if other != code] if begun else []
         if others and code != UNKNOWN:
-            whose = "code that nobody noted" if others == [UNKNOWN] else "other code of the same version"
-            out(f"   note: what is finished of {place} was made by {whose}; it is kept (to begin anew, delete {path})")
+            maker = "code that nobody noted" if others == [UNKNOWN] else "other code of the same version"
+            out(f"   note: what is finished of {place} was made by {maker}; it is kept (to begin anew, delete {path})")
         facts = {"purpose": purpose, "codes": [*others, code]}
         if before is None or not facts.items() <= before.items():
             write_sealed(path / DRAFT, {**about, **facts})
@@ -201,9 +201,10 @@ class Store:
         except OSError:
             pass  # a read-only store can still be read
 
-    def _used(self, key: str, made: float) -> float:
-        path = self.root / ".used" / key
-        return path.stat().st_mtime if path.exists() else made
+    def _used(self, node: _Node) -> float:
+        """When the artifact was last used, in seconds of the epoch; when it was committed, if nobody noted a use."""
+        path = self.root / ".used" / node.key
+        return path.stat().st_mtime if path.exists() else node.committed
 
     def pinned(self, key: str) -> bool:
         return (self.root / ".pins" / key).exists()
@@ -229,18 +230,17 @@ class Store:
         a draft that is kept. ``claimed``: a key whose claim the caller holds itself.
         """
         horizon = time.time() - days * 86400
-        found: list[tuple[Path, str]] = []
+        garbage: list[tuple[Path, str]] = []
         for pattern in TRASH:
-            found += [(path, "trash: replaced or set aside, or left by an interrupted gc") for path in self.root.glob(pattern)]
+            reason = "trash: replaced or set aside, or left by an interrupted gc"
+            garbage += [(path, reason) for path in self.root.glob(pattern)]
         nodes = [node for path in self.folders() if (node := self._node(path)) is not None]
-        todo = [
-            node.key for node in nodes if node.damaged or self.pinned(node.key) or self._used(node.key, node.made) >= horizon
-        ]
+        todo = [node.key for node in nodes if node.damaged or self.pinned(node.key) or self._used(node) >= horizon]
         for path in self.drafts():
             key = path.name.removesuffix(".partial")
             held = key != claimed and self.claim(self.place_of(path), key).holder() is not None
             if not held and not _changed_since(path, horizon):
-                found.append((path, f"unfinished and untouched for {days:g} days"))
+                garbage.append((path, f"unfinished and untouched for {days:g} days"))
             elif (draft := read_draft(path)) is not None:
                 todo += draft["preimage"]["inputs"].values()
             else:  # damaged, or not written yet: any artifact may be its input
@@ -251,13 +251,13 @@ class Store:
             if (key := todo.pop()) not in needed:
                 needed.add(key)
                 todo += inputs.get(key, ())
-        for node in sorted(nodes, key=lambda node: node.made, reverse=True):
+        for node in sorted(nodes, key=lambda node: node.committed, reverse=True):
             if node.key not in needed:
-                found.append((node.path, f"not pinned, not used for {days:g} days"))
+                garbage.append((node.path, f"not pinned, not used for {days:g} days"))
             else:
                 left = [node.path / name for name in WORKING if (node.path / name).exists()]
-                found += [(path, "left over by a commit that was interrupted") for path in left]
-        return found
+                garbage += [(path, "left over by a commit that was interrupted") for path in left]
+        return garbage
 
     def remove(self, path: Path, days: float) -> bool:
         """Delete what ``garbage(days)`` listed, unless somebody works on it or has come to need it since; says whether.
@@ -273,7 +273,7 @@ class Store:
             if not claim.take():
                 return False
             try:
-                if path not in [found for found, _ in self.garbage(days, key)]:
+                if path not in [entry for entry, _ in self.garbage(days, key)]:
                     return False
                 path = self.trash(path)
             finally:
@@ -296,18 +296,18 @@ class Store:
             stamp = stat.st_ino, stat.st_mtime_ns, stat.st_size
         except OSError:
             stamp = None
-        known = self._nodes.get(folder)
-        if known is None or stamp is None or known[0] != stamp:
+        cached = self._nodes.get(folder)
+        if cached is None or stamp is None or cached[0] != stamp:
             try:
-                about = Artifact(folder).manifest
+                origin = Artifact(folder).manifest
             except Damaged:
                 if not folder.exists():
                     return None
-                about = read_draft(folder) or {"key": folder.name, "preimage": {"inputs": {}}}
-            made, inputs = about.get("finished"), tuple(about["preimage"]["inputs"].values())
-            known = stamp, _Node(folder, about["key"], made or 0.0, inputs, damaged=made is None)
-            self._nodes[folder] = known
-        return known[1]
+                origin = read_draft(folder) or {"key": folder.name, "preimage": {"inputs": {}}}
+            committed, inputs = origin.get("finished"), tuple(origin["preimage"]["inputs"].values())
+            cached = stamp, _Node(folder, origin["key"], committed or 0.0, inputs, damaged=committed is None)
+            self._nodes[folder] = cached
+        return cached[1]
 
 
 class _Node(NamedTuple):
@@ -315,7 +315,7 @@ class _Node(NamedTuple):
 
     path: Path
     key: str
-    made: float
+    committed: float  # seconds of the epoch; 0 where its manifest is damaged
     inputs: tuple[str, ...]  # their keys
     damaged: bool  # its manifest is
 
@@ -344,11 +344,11 @@ def iter_inputs(store: Store, artifact: Artifact) -> Iterator[tuple[str, str, Ar
 
 def history(inputs: Mapping[str, Artifact]) -> dict[str, dict[str, Any]]:
     """Stage -> preimage of its key, for ``inputs`` and everything upstream of them that is still in the store."""
-    found: dict[str, dict[str, Any]] = {}
+    preimages: dict[str, dict[str, Any]] = {}
     todo = list(inputs.values())
     while todo:
         artifact = todo.pop()
-        if artifact.stage not in found:
-            found[artifact.stage] = artifact.manifest["preimage"]
+        if artifact.stage not in preimages:
+            preimages[artifact.stage] = artifact.manifest["preimage"]
             todo += [parent for _, _, parent in iter_inputs(store_of(artifact), artifact) if parent is not None]
-    return found
+    return preimages
