@@ -21,6 +21,8 @@ SMALL = [
     "fit.checkpoint_every=10", "workers=2",
 ]  # fmt: skip
 
+QUICK = ["evaluate.video_frames=2", "evaluate.timing_frames=1", "evaluate.timing_size=[64,36]", "evaluate.page_views=0"]
+
 
 def run(store: Path, *words: str) -> str:
     command = [sys.executable, "-m", "pipeline", *SMALL, f"store={store}", *words]
@@ -56,6 +58,17 @@ def test_from_nothing_to_a_page(line):
 def test_a_second_run_computes_nothing(line):
     store, _ = line
     assert run(store, "stage=bake").count("up to date") == 5
+
+
+def test_the_line_ends_with_a_report_that_says_where_the_page_is(line):
+    store, _ = line
+    output = run(store, "stage=evaluate", *QUICK).splitlines()
+    assert output[-1].endswith("report.html") and Path(output[-1].split(": ")[1]).is_file()
+    assert any("site/index.html" in text for text in output)
+    made = artifact(store, "evaluate")
+    assert {row.group for row in made.rows()} == {"test", "shift"}
+    assert run(store, "stage=evaluate", *QUICK).count("up to date") == 6
+    assert "equal to before" in run(store, "stage=evaluate", *QUICK, "force=evaluate", "workers=0")
 
 
 def test_other_steps_fit_anew_and_render_no_street(line):
