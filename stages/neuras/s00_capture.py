@@ -113,9 +113,12 @@ class Capture(MapStage):
 
             source.prepare(config, folder)
 
+    def open(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any]) -> Source:
+        return _source(config)
+
     def open_prepared(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any], folder: Path) -> Source:
         if not isinstance(config, StreetCaptureConfig):
-            return _source(config)
+            return self.open(config, inputs, environment)
         from stages.graphics.mitsuba import backend
         from stages.neuras.street.source import StreetSource
 

@@ -21,7 +21,7 @@ from pydantic import Field, create_model, model_validator
 
 from model.renderformer.config import FIXED, ModelConfig
 from model.renderformer.recipe import FitConfig
-from model.training.threads import wait_without_spinning
+from model.training.threads import wait_briefly
 from pipeline.config import Section, StageConfig, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, RunStage
@@ -115,7 +115,7 @@ class Train(RunStage):
         return estimate(config, configs)
 
     def run(self, config: TrainConfig, inputs: Inputs, draft: Draft) -> list[str]:
-        wait_without_spinning()
+        wait_briefly()
         from model.training.parallel import join
 
         with join(choose_device(config.device, "train.device")) as group:
@@ -133,7 +133,7 @@ class Train(RunStage):
         return ["checkpoint/config.json", "checkpoint/model.safetensors"]
 
     def follow(self, config: TrainConfig, inputs: Inputs) -> None:
-        wait_without_spinning()
+        wait_briefly()
         from model.training.parallel import join
 
         with join(choose_device(config.device, "train.device")) as group:

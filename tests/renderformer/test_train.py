@@ -238,19 +238,20 @@ def test_a_given_model_is_not_tested_on_objects_that_it_was_trained_on(trained, 
 
 
 @pytest.mark.parametrize("policy", [{}, {"GOMP_SPINCOUNT": "7"}, {"OMP_WAIT_POLICY": "active"}])
-def test_threads_wait_without_spinning_unless_the_user_says_how(policy):
+def test_threads_wait_briefly_unless_the_user_says_how(policy):
     import os
 
     code = """if True:
         import os, sys
-        from model.training.threads import wait_without_spinning
-        wait_without_spinning()
-        print(os.environ.get("OMP_WAIT_POLICY"), "torch" in sys.modules)"""
+        from model.training.threads import wait_briefly
+        wait_briefly()
+        print(os.environ.get("OMP_WAIT_POLICY"), os.environ.get("GOMP_SPINCOUNT"), "torch" in sys.modules)"""
     clean = {
         name: value for name, value in os.environ.items() if name not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
     }
     output = subprocess.run([sys.executable, "-c", code], env=clean | policy, capture_output=True, text=True, check=True).stdout
-    assert output.split() == [policy.get("OMP_WAIT_POLICY", "None") if policy else "passive", "False"]
+    spins = policy.get("GOMP_SPINCOUNT", "None") if policy else "100000"
+    assert output.split() == [policy.get("OMP_WAIT_POLICY", "None"), spins, "False"]
 
 
 def test_resolution_must_suit_the_model(shard, tmp_path):
