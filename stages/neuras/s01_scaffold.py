@@ -29,11 +29,13 @@ class ScaffoldConfig(StageConfig):
     source: Literal["auto", "given", "poisson", "terrain"] = "auto"  # auto: given mesh, else Poisson, terrain under a flight
     voxel_m: float = Field(0.08, gt=0)  # points are thinned to one per voxel
     neighbours: int = Field(12, ge=4, le=64)  # of a point, for its normal
-    depth: int = Field(10, ge=5, le=13)  # levels of Poisson's octree
+    depth: int = Field(11, ge=5, le=13)  # levels of Poisson's octree
     trim_m: float = Field(0.6, gt=0)  # reconstructed surface farther than this from all points goes
+    carve: bool = True  # drop what LiDAR beams went through
+    carve_m: float = Field(0.3, gt=0)  # a beam may meet the surface so much before its end
     longest_m: float = Field(8.0, gt=0)  # longest side of a triangle of terrain, seen from above
     weld_m: float = Field(0.02, gt=0)  # vertices in one cell of this size become one
-    faces: int | None = Field(60_000, ge=100)  # about this many after QSlim; null: all
+    faces: int | None = Field(150_000, ge=100)  # about this many after QSlim; null: all
     speck_faces: int = Field(25, ge=0)  # connected pieces of fewer faces go
     cull: bool = True  # drop faces that no camera sees
     cull_rays: int = Field(2, ge=1, le=4)  # rays through a pixel, in both directions
@@ -108,7 +110,7 @@ def _surface(
 ) -> tuple[Mesh, dict[str, Any]]:
     """The mesh to simplify, and how it came about."""
     from stages.neuras.records import given_mesh
-    from stages.neuras.surfaces import reconstruct
+    from stages.neuras.surfaces import reconstruct, visibility
 
     given = given_mesh(capture)
     looking = np.mean([-view.camera.camera_to_world[:3, 2] for view in views], axis=0)
@@ -124,12 +126,18 @@ def _surface(
     if len(points) < 100:
         raise UserError(f"the capture has {len(points)} points, too few for a surface: give it a mesh (capture.mesh=FILE)")
     voxel = config.voxel_m * info.metre
+    beams = points, viewers
     points, viewers = reconstruct.thin(points, voxel, viewers)
     stated = {"source": source, "points": len(points)}
     if source == "terrain":
         return reconstruct.terrain(points, np.array(info.up), config.longest_m * info.metre), stated
     point_normals = reconstruct.normals(points, viewers, config.neighbours)
-    return reconstruct.poisson(points, point_normals, config.depth, config.trim_m * info.metre), stated
+    mesh = reconstruct.poisson(points, point_normals, config.depth, config.trim_m * info.metre)
+    if config.carve and info.points == "lidar":
+        closed = len(mesh.faces)
+        mesh = visibility.carved(mesh, *beams, config.carve_m * info.metre)
+        stated["carved"] = closed - len(mesh.faces)
+    return mesh, stated
 
 
 def _points(capture: Artifact, views: list[FrameRecord]) -> tuple[np.ndarray, np.ndarray]:

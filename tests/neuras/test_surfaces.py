@@ -121,6 +121,19 @@ def test_culling_drops_the_far_side_and_keeps_what_cameras_beside_see():
     assert one.sum() < len(kept.faces) < len(mesh.faces)
 
 
+def test_what_beams_went_through_is_not_there():
+    wall = trimesh.creation.box((0.1, 8, 8), transform=trimesh.transformations.translation_matrix((5, 0, 0)))
+    sheet = Mesh(np.array([[2, -1, -1], [2, 1, -1], [2, 0, 1]], np.float32), np.array([[0, 1, 2]], np.int32))
+    n = len(wall.vertices)
+    both = Mesh(np.concatenate([wall.vertices, sheet.vertices]).astype(np.float32), np.concatenate([wall.faces, sheet.faces + n]).astype(np.int32))
+    y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-2, 2, 20), np.linspace(-2, 2, 20)))
+    ends = np.stack([np.full_like(y, 4.95), y, z], axis=1)
+    left = visibility.carved(both, ends, np.zeros_like(ends), 0.3)
+    assert len(left.faces) == len(both.faces) - 1 and left.vertices[:, 0].min() > 4
+    stopped = np.where((np.arange(len(ends)) % 5 < 3)[:, None], ends * 2 / 4.95, ends)  # most beams end at the sheet
+    assert len(visibility.carved(both, stopped, np.zeros_like(ends), 0.3).faces) == len(both.faces)
+
+
 def test_pixels_per_unit_grow_as_the_camera_comes_nearer():
     mesh = sphere(3)
     near, far = (visibility.pixels_per_unit(mesh, [looking_at_origin((d, 0.0, 0.0))]).max() for d in (4.0, 8.0))

@@ -1,4 +1,4 @@
-"""Which faces the cameras see, and how finely."""
+"""Which faces the cameras see, and how finely; and which faces beams went through."""
 
 from __future__ import annotations
 
@@ -35,6 +35,31 @@ def kept_faces(mesh: Mesh, visible: np.ndarray, rings: int) -> Mesh:
         visible = touched[mesh.faces].any(axis=1)
     vertices, faces = measure.compact(mesh.vertices.astype(np.float64), mesh.faces[visible].astype(np.int64))
     return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+
+
+def carved(mesh: Mesh, points: np.ndarray, sensors: np.ndarray, slack: float, rounds: int = 4) -> Mesh:
+    """Without the faces that more beams went through than ended at.
+
+    A beam goes from ``sensors`` (P, 3) to ``points`` (P, 3), and nothing stands between. Reconstruction closes such gaps: between
+    the leaves of a tree, say, or a lamp and the wall behind. A beam goes through a face that it meets more than ``slack``
+    (world units, or 2 % of its length if that is more) before its end. Each round looks behind the faces of the one before.
+    """
+    ways = points - sensors
+    lengths = np.linalg.norm(ways, axis=1)
+    ways = ways / np.maximum(lengths, 1e-12)[:, None]
+    near_end = np.maximum(slack, 0.02 * lengths)
+    for _ in range(rounds):
+        face, _, distance = Caster(mesh.vertices, mesh.faces).cast(sensors, ways)
+        met = face >= 0
+        through = met & (distance < lengths - near_end)
+        ended = met & (np.abs(distance - lengths) <= near_end)
+        passed, stopped = (np.bincount(face[which], minlength=len(mesh.faces)) for which in (through, ended))
+        empty = passed > stopped
+        if not empty.any() or empty.all():
+            break
+        vertices, faces = measure.compact(mesh.vertices.astype(np.float64), mesh.faces[~empty].astype(np.int64))
+        mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+    return mesh
 
 
 def pixels_per_unit(mesh: Mesh, cameras: Iterable[Camera]) -> np.ndarray:
