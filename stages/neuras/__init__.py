@@ -14,5 +14,17 @@ SYSTEM = System(
     },
     targets={"data": ("atlas",), "train": ("fit",), "eval": ("evaluate",)},
     commands="stages.neuras.commands:add_commands",
-    packages=("lightmill", "torch", "mitsuba", "drjit", "pymeshlab", "xatlas", "moderngl", "numpy", "scipy", "pyoidn", "hydra-core"),
+    packages=(
+        "lightmill",
+        "torch",
+        "mitsuba",
+        "drjit",
+        "pymeshlab",
+        "xatlas",
+        "moderngl",
+        "numpy",
+        "scipy",
+        "pyoidn",
+        "hydra-core",
+    ),
 )

@@ -50,7 +50,7 @@ class FitStageConfig(StageConfig):
     patch: int = Field(8, ge=2)  # pixels along a patch
     patches: int = Field(128, ge=1)  # of a step
     lr: float = Field(0.01, gt=0)  # of textures and codes
-    network_lr: float = Field(0.01, gt=0)
+    network_lr: float = Field(0.003, gt=0)
     final_lr: float = Field(0.1, ge=0, le=1)  # share of both at the end of the cosine
     vq: float = Field(0.1, ge=0)  # lambda_vq
     commitment: float = Field(0.25, ge=0)  # beta

@@ -33,7 +33,10 @@ def baked(
 
     def network(*sizes: int):
         pairs = zip(sizes[:-1], sizes[1:], strict=True)
-        made = [(rng.normal(0, 1.6 / np.sqrt(a), (b, a)).astype(np.float32), rng.normal(0, 0.1, b).astype(np.float32)) for a, b in pairs]
+        made = [
+            (rng.normal(0, 1.6 / np.sqrt(a), (b, a)).astype(np.float32), rng.normal(0, 0.1, b).astype(np.float32))
+            for a, b in pairs
+        ]
         made[-1][1][:] = 0.5
         return made
 
@@ -66,7 +69,9 @@ def baked(
     )
 
 
-def looking_at(position: tuple[float, float, float], target: tuple[float, float, float] = (0.0, 0.0, 0.0), size=(96, 64)) -> Camera:
+def looking_at(
+    position: tuple[float, float, float], target: tuple[float, float, float] = (0.0, 0.0, 0.0), size=(96, 64)
+) -> Camera:
     back = np.array(position, float) - np.array(target, float)
     back /= np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)

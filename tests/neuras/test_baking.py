@@ -119,7 +119,9 @@ def photographed(flat: AtlasMesh, baked: Baked) -> list[FrameRecord]:
 INFO = CaptureInfo("metre", 1.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 5.0, "none", "every other")
 
 
-@pytest.mark.parametrize("settings, expand", [({}, "fp16"), ({}, "rgba8"), ({"quantized": False}, "rgba8"), ({"networks": False}, "fp16")])
+@pytest.mark.parametrize(
+    "settings, expand", [({}, "fp16"), ({}, "rgba8"), ({"quantized": False}, "rgba8"), ({"networks": False}, "fp16")]
+)
 def test_the_page_draws_what_torch_computes(tmp_path, settings, expand):
     if browser.find_browser() is None:
         pytest.skip("no Chromium: install chromium")

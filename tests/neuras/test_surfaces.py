@@ -125,7 +125,10 @@ def test_what_beams_went_through_is_not_there():
     wall = trimesh.creation.box((0.1, 8, 8), transform=trimesh.transformations.translation_matrix((5, 0, 0)))
     sheet = Mesh(np.array([[2, -1, -1], [2, 1, -1], [2, 0, 1]], np.float32), np.array([[0, 1, 2]], np.int32))
     n = len(wall.vertices)
-    both = Mesh(np.concatenate([wall.vertices, sheet.vertices]).astype(np.float32), np.concatenate([wall.faces, sheet.faces + n]).astype(np.int32))
+    both = Mesh(
+        np.concatenate([wall.vertices, sheet.vertices]).astype(np.float32),
+        np.concatenate([wall.faces, sheet.faces + n]).astype(np.int32),
+    )
     y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-2, 2, 20), np.linspace(-2, 2, 20)))
     ends = np.stack([np.full_like(y, 4.95), y, z], axis=1)
     left = visibility.carved(both, ends, np.zeros_like(ends), 0.3)
@@ -155,7 +158,10 @@ def test_an_atlas_is_the_same_surface(atlas):
     assert flat.uvs.min() >= 0 and flat.uvs.max() <= 1
     a, b, c = (flat.uvs[flat.faces[:, i]].astype(float) * (flat.width, flat.height) for i in range(3))
     areas = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
-    surface = np.linalg.norm(np.cross(*(mesh.vertices[mesh.faces[:, i]] - mesh.vertices[mesh.faces[:, 0]] for i in (1, 2))), axis=1) / 2
+    surface = (
+        np.linalg.norm(np.cross(*(mesh.vertices[mesh.faces[:, i]] - mesh.vertices[mesh.faces[:, 0]] for i in (1, 2))), axis=1)
+        / 2
+    )
     assert np.median(np.sqrt(areas / surface)) == pytest.approx(20.0, rel=0.1)
 
 

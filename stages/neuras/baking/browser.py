@@ -88,9 +88,7 @@ class _Handler(SimpleHTTPRequestHandler):
         self.end_headers()
 
 
-def pictures(
-    site: Path, links: Sequence[str], timing: int = 0, wait_s: float = 180.0
-) -> tuple[list[np.ndarray], list[float]]:
+def pictures(site: Path, links: Sequence[str], timing: int = 0, wait_s: float = 180.0) -> tuple[list[np.ndarray], list[float]]:
     """(H, W, 3) uint8 pictures of the links, such as "frame=3&shift=2", each of its frame's size; and ``timing`` frame times in ms
     of the last one.
 

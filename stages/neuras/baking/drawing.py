@@ -91,7 +91,9 @@ class Drawing:
         self._screen = self._gl.vertex_array(self._sky, [])
         self._target: Any = None
 
-    def _upload(self, program: Any, name: str, maps: np.ndarray, ranges: Ranges | None, array: bool) -> list[tuple[Any, str, Any]]:
+    def _upload(
+        self, program: Any, name: str, maps: np.ndarray, ranges: Ranges | None, array: bool
+    ) -> list[tuple[Any, str, Any]]:
         """Textures of (N, H, W, D) features, four channels each."""
         count, height, width, channels = maps.shape
         made = []

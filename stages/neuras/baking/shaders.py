@@ -122,7 +122,8 @@ def sky_shaders(baked: Baked, dialect: str, ranges: Ranges | None) -> tuple[str,
     count, (layers, _) = textures(baked.channels), baked.sky_size
     samplers = "".join(f"uniform sampler2DArray sky{i};\n" for i in range(count))
     features = "".join(
-        f"        vec4 f{i} = {_texel(f'texture(sky{i}, vec3(st, float(6 * layer + face)))', ranges, i)};\n" for i in range(count)
+        f"        vec4 f{i} = {_texel(f'texture(sky{i}, vec3(st, float(6 * layer + face)))', ranges, i)};\n"
+        for i in range(count)
     )
     halves = ", ".join(f"vec3({_list(half)})" for half in baked.sky_half_sizes)
     hidden_count = -(-len(baked.sky_mlp[0][1]) // 4) if baked.sky_mlp else count

@@ -76,9 +76,7 @@ def write_site(
         "textures": textures(baked.channels),
         "quantized": baked.quantized,
         "expand": "rgba8" if bytes_wanted else "fp16",
-        "ranges": {
-            name: None if r is None else {"low": r.low.tolist(), "span": r.span.tolist()} for name, r in ranges.items()
-        },
+        "ranges": {name: None if r is None else {"low": r.low.tolist(), "span": r.span.tolist()} for name, r in ranges.items()},
         "mesh": {"width": atlas.width, "height": atlas.height, "faces": len(atlas.faces)},
         "skyboxes": {"count": layers, "side": side, "half_sizes": baked.sky_half_sizes.tolist()},
         "codes": {name: len(book) for name, book in (("mesh", baked.mesh_codebook), ("sky", baked.sky_codebook))}

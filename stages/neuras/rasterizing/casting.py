@@ -89,7 +89,9 @@ class Caster:
         return GBuffer(face.reshape(shape), barycentric.reshape(*shape, 2), depth.reshape(shape))
 
 
-def _intersect(starts: np.ndarray, rays: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _intersect(
+    starts: np.ndarray, rays: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Barycentric weights (N, 2) of b and c, clamped to the triangle, and distances (N,) of rays with planes of a, b, c (N, 3)."""
     ab, ac = b - a, c - a
     cross = np.cross(rays, ac)
