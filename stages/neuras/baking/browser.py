@@ -89,8 +89,8 @@ class _Handler(SimpleHTTPRequestHandler):
 
 
 def pictures(site: Path, links: Sequence[str], timing: int = 0, wait_s: float = 180.0) -> tuple[list[np.ndarray], list[float]]:
-    """(H, W, 3) uint8 pictures of the links, such as "frame=3&shift=2", each of its frame's size; and ``timing`` frame times in ms
-    of the last one.
+    """(H, W, 3) uint8 pictures of the links, such as "frame=3&shift=2", each of its frame's size; and ``timing`` frame times
+    of the last one, in ms.
 
     Raises RuntimeError without a browser, where the page fails (with its words), or where it is silent for ``wait_s``.
     """

@@ -52,8 +52,8 @@ def lens(camera: Camera) -> tuple[float, float, float, float]:
 class Drawing:
     """A scene on the GPU. Use as a context manager, or ``close`` it.
 
-    texture_format: "fp16" holds features as half floats, "rgba8" as bytes with a range per channel. ``near`` and ``far``: of the
-    depth buffer, world units.
+    texture_format: "fp16" holds features as half floats, "rgba8" as bytes with a range per channel. ``near`` and ``far``: of
+    the depth buffer, world units.
     """
 
     def __init__(self, baked: Baked, atlas: AtlasMesh, near: float, far: float, texture_format: TextureFormat = "fp16"):

@@ -92,7 +92,10 @@ class Caster:
 def _intersect(
     starts: np.ndarray, rays: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric weights (N, 2) of b and c, clamped to the triangle, and distances (N,) of rays with planes of a, b, c (N, 3)."""
+    """Where rays meet the planes of triangles with corners a, b, c (N, 3).
+
+    Returns the barycentric weights (N, 2) of b and c, clamped to the triangle, and distances (N,).
+    """
     ab, ac = b - a, c - a
     cross = np.cross(rays, ac)
     det = np.einsum("ij,ij->i", ab, cross)
