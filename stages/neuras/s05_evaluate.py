@@ -137,6 +137,7 @@ class Evaluate(MapStage):
 
         html = report.page(about, summary, timing, missing, clips, picture)
         (draft.files / "report.html").write_text(html, encoding="utf-8")
+        (draft.files / "overview.png").write_bytes(report.overview(summary, picture))
         draft.note("summary", report.headline(summary))
         for line in report.lines(summary):
             draft.log(line)

@@ -6,7 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from pipeline.store import Store
 from stages.neuras.records import CaptureInfo, frames, load_atlas
@@ -64,6 +66,8 @@ def test_the_line_ends_with_a_report_that_says_where_the_page_is(line):
     store, _ = line
     output = run(store, "stage=evaluate", *QUICK).splitlines()
     assert output[-1].endswith("report.html") and Path(output[-1].split(": ")[1]).is_file()
+    overview = np.array(Image.open(Path(output[-1].split(": ")[1]).with_name("overview.png")))
+    assert overview.shape[0] == 2 * 54 and not np.array_equal(overview[:54], overview[54:])  # photo above, ours below
     assert any("site/index.html" in text for text in output)
     made = artifact(store, "evaluate")
     assert {row.group for row in made.rows()} == {"test", "shift"}

@@ -268,6 +268,24 @@ def gallery(summary: Summary, limit: int, read: ReadPicture) -> list[dict[str, A
     return rows
 
 
+def overview(summary: Summary, read: ReadPicture, columns: int = 2) -> bytes:
+    """A PNG of the views farthest beside the driven path, one of each side: photo above, ours below.
+
+    Of a side it is the view in the middle, from worst to best. Where no view lies beside the path, views between frames.
+    """
+    farthest = max(group["metres"] for group in summary["groups"])
+    groups = [group for group in summary["groups"] if group["kind"] != "both" and group["metres"] == farthest]
+    scores = {view["id"]: view["scores"]["ours"]["psnr"] for view in summary["per_view"]}
+    shown = []
+    for group in groups[:columns]:
+        ranked = sorted(group["ids"], key=lambda id: (scores[id], id))
+        pair = [Image.open(io.BytesIO(read(ranked[len(ranked) // 2], name))).convert("RGB") for name in ("photo", "ours")]
+        shown.append(np.concatenate([np.array(picture) for picture in pair]))
+    buffer = io.BytesIO()
+    Image.fromarray(np.concatenate([row for row in shown if row.shape == shown[0].shape], axis=1)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
 def thumbnail(data: bytes) -> str:
     """A PNG as a JPEG of at most ``WIDEST`` pixels width, as a data URI."""
     image = Image.open(io.BytesIO(data)).convert("RGB")
