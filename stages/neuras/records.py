@@ -33,8 +33,8 @@ class FrameRecord:
     """A posed image.
 
     picture: the bytes of a PNG or JPEG, of the camera's size. mask: the bytes of a PNG with one channel, 0 where a pixel is to
-    be ignored; None where all count. trajectory: its path, such as "drive" or "shift_2m_right"; ``shift``: metres to the right of
-    the drive. time: seconds, None where unknown. depth: (H, W) float32 true distance along the ray in world units, 0
+    be ignored; None where all count. trajectory: its path, such as "drive" or "shift_2m_right"; ``shift``: metres to the right
+    of the drive. time: seconds, None where unknown. depth: (H, W) float32 true distance along the ray in world units, 0
     for nothing, only where truth is known.
     """
 

@@ -41,8 +41,9 @@ def carved(mesh: Mesh, points: np.ndarray, sensors: np.ndarray, slack: float, ro
     """Without the faces that more beams went through than ended at.
 
     A beam goes from ``sensors`` (P, 3) to ``points`` (P, 3), and nothing stands between. Reconstruction closes such gaps:
-    between the leaves of a tree, say, or a lamp and the wall behind. A beam goes through a face that it meets more than ``slack``
-    (world units, or 2 % of its length if that is more) before its end. Each round looks behind the faces of the one before.
+    between the leaves of a tree, say, or a lamp and the wall behind. A beam goes through a face that it meets more than
+    ``slack`` (world units, or 2 % of its length if that is more) before its end. Each round looks behind the faces that the
+    one before removed.
     """
     ways = points - sensors
     lengths = np.linalg.norm(ways, axis=1)
