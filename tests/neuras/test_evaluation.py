@@ -196,6 +196,7 @@ def test_ours_and_warping_are_scored_apart_and_the_shader_agrees(run):
     assert {path.name for path in files.iterdir()} == {
         "report.html",
         "metrics.json",
+        "overview.png",
         "timing.json",
         "drive.mp4",
         "lane_change.mp4",
