@@ -1,6 +1,6 @@
 """A sheet of the made-up places: two seeds of the street from the lane, one of them 3 m aside, and two views of the flight.
 
-python checks/street.py docs/street.png
+python checks/street.py docs/street.jpg
 """
 
 from __future__ import annotations

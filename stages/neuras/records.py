@@ -158,6 +158,14 @@ class Mesh:
     vertices: np.ndarray
     faces: np.ndarray
 
+    @classmethod
+    def compact(cls, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+        """Of any number types, without the vertices that no face uses."""
+        from stages.graphics.geometry import measure
+
+        vertices, faces = measure.compact(np.asarray(vertices, np.float64), np.asarray(faces, np.int64))
+        return cls(vertices.astype(np.float32), faces.astype(np.int32))
+
 
 @dataclass(frozen=True, eq=False)
 class AtlasMesh:
@@ -174,6 +182,12 @@ class AtlasMesh:
     width: int
     height: int
 
+    def vertex_charts(self) -> np.ndarray:
+        """(N,) float32: the chart that each vertex belongs to."""
+        charts = np.zeros(len(self.vertices), np.float32)
+        charts[self.faces] = self.charts[:, None]
+        return charts
+
 
 def save(path: Path, value: Mesh | AtlasMesh) -> None:
     """Write ``mesh.npz`` or ``atlas.npz``, the same bytes every time."""
@@ -184,6 +198,11 @@ def given_mesh(capture: Artifact) -> Mesh | None:
     """The mesh that came with a capture, if one did."""
     path = capture.path / "files" / "mesh.npz"
     return Mesh(**unpack_arrays(path.read_bytes())) if path.exists() else None
+
+
+def scaffold_mesh(scaffold: Artifact) -> Mesh:
+    """The mesh of a *scaffold* artifact."""
+    return Mesh(**unpack_arrays(scaffold.read("mesh").members["mesh.npz"]))
 
 
 def load_atlas(path: Path) -> AtlasMesh:

@@ -16,7 +16,7 @@ from pydantic import Field
 from pipeline.config import StageConfig
 from pipeline.errors import Reject, UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
-from stages.graphics.arrays import pack_arrays, pack_json, unpack_arrays, unpack_json
+from stages.graphics.arrays import pack_arrays, pack_json, unpack_json
 
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Draft
@@ -96,13 +96,6 @@ class Scaffold(MapStage):
     def finish(self, config: ScaffoldConfig, inputs: Inputs, draft: Draft) -> None:
         for row in draft.rows():
             draft.note("summary", unpack_json(draft.read(row.id).members["mesh.json"]))
-
-
-def scaffold_mesh(scaffold: Artifact) -> Mesh:
-    """The mesh of a *scaffold* artifact."""
-    from stages.neuras.records import Mesh
-
-    return Mesh(**unpack_arrays(scaffold.read("mesh").members["mesh.npz"]))
 
 
 def _surface(

@@ -18,7 +18,7 @@ from pipeline.errors import Reject, UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from pipeline.store.files import write_atomic
 from stages.graphics.arrays import pack_arrays, pack_json, unpack_arrays, unpack_json
-from stages.neuras.s01_scaffold import scaffold_mesh
+from stages.neuras.records import scaffold_mesh
 
 if TYPE_CHECKING:
     from pipeline.store import Draft

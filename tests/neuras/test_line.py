@@ -11,8 +11,7 @@ import pytest
 from PIL import Image
 
 from pipeline.store import Store
-from stages.neuras.records import CaptureInfo, frames, load_atlas
-from stages.neuras.s01_scaffold import scaffold_mesh
+from stages.neuras.records import CaptureInfo, frames, load_atlas, scaffold_mesh
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = [

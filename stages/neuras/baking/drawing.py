@@ -78,9 +78,9 @@ class Drawing:
             texture = self._gl.texture(codes.shape[::-1], 1, np.ascontiguousarray(codes).tobytes(), alignment=1, dtype="u2")
             texture.filter = (self._gl.NEAREST, self._gl.NEAREST)
             self._textures.append((self._mesh, "codes", texture))
-        chart = np.zeros(len(atlas.vertices), np.float32)
-        chart[atlas.faces] = atlas.charts[:, None]
-        vertices = np.concatenate([atlas.vertices - self._centre, atlas.uvs, chart[:, None]], axis=1).astype(np.float32)
+        vertices = np.concatenate([atlas.vertices - self._centre, atlas.uvs, atlas.vertex_charts()[:, None]], axis=1).astype(
+            np.float32
+        )
         parts = (self._gl.buffer(vertices.tobytes()), "3f 2f 1f", "position", "uv", "chart")
         kept = [name for name in parts[2:] if name in self._mesh]
         layout = " ".join(

@@ -49,9 +49,8 @@ def write_site(
     """
     (folder / "shaders").mkdir(parents=True, exist_ok=True)
     (folder / "frames").mkdir(exist_ok=True)
-    mesh, sky = baked.mesh_texture(), baked.sky_textures()
     bytes_wanted = expand == "rgba8" or not baked.quantized  # the page has no half-float files
-    ranges = {"mesh": Ranges.of(mesh), "sky": Ranges.of(sky)} if bytes_wanted else {"mesh": None, "sky": None}
+    ranges = _ranges(baked) if bytes_wanted else {"mesh": None, "sky": None}
     _geometry(folder / "geometry.glb", atlas, baked.sky_centre)
     if baked.quantized:
         _codes(folder / "mesh_codes.png", baked.mesh_indices)
@@ -59,7 +58,7 @@ def write_site(
         books = [np.ascontiguousarray(book, np.float32) for book in (baked.mesh_codebook, baked.sky_codebook)]
         (folder / "codebooks.bin").write_bytes(b"".join(book.tobytes() for book in books))
     else:
-        for name, maps in (("mesh", mesh), ("sky", _in_rows(sky))):
+        for name, maps in (("mesh", baked.mesh_texture()), ("sky", _in_rows(baked.sky_textures()))):
             values = ranges[name].quantized(maps)
             for index in range(textures(baked.channels)):
                 part = np.ascontiguousarray(values[..., 4 * index : 4 * index + 4])
@@ -98,6 +97,14 @@ def write_site(
     return sizes(folder)
 
 
+def _ranges(baked: Baked) -> dict[str, Ranges]:
+    """Of all features that a texel has; of codes without making the maps, which may take gigabytes."""
+    if not baked.quantized:
+        return {"mesh": Ranges.of(baked.mesh_texture()), "sky": Ranges.of(baked.sky_textures())}
+    books = {"mesh": (baked.mesh_codebook, baked.mesh_indices), "sky": (baked.sky_codebook, baked.sky_indices)}
+    return {name: Ranges.of(book[np.unique(indices)]) for name, (book, indices) in books.items()}
+
+
 def _in_rows(maps: np.ndarray) -> np.ndarray:
     """(L S, 6 S, ..): the faces (L, 6, S, S, ..) as one picture, a row for each skybox."""
     layers, faces, side = maps.shape[:3]
@@ -106,14 +113,12 @@ def _in_rows(maps: np.ndarray) -> np.ndarray:
 
 def _geometry(path: Path, atlas: AtlasMesh, centre: np.ndarray) -> None:
     """A binary glTF. Indices and attributes lie in one buffer, in the order of its accessors."""
-    chart = np.zeros(len(atlas.vertices), np.float32)
-    chart[atlas.faces] = atlas.charts[:, None]
     positions = (atlas.vertices - np.asarray(centre)).astype(np.float32)
     arrays = [
         (np.ascontiguousarray(atlas.faces, np.uint32).ravel(), 5125, "SCALAR", 34963),
         (positions, 5126, "VEC3", 34962),
         (np.ascontiguousarray(atlas.uvs, np.float32), 5126, "VEC2", 34962),
-        (chart, 5126, "SCALAR", 34962),
+        (atlas.vertex_charts(), 5126, "SCALAR", 34962),
     ]
     accessors: list[dict[str, Any]] = []
     views, data = [], b""

@@ -59,7 +59,7 @@ def poisson(points: np.ndarray, point_normals: np.ndarray, depth: int, trim: flo
     mesh = meshes.current_mesh()
     vertices, faces = mesh.vertex_matrix(), np.asarray(mesh.face_matrix(), np.int64)
     near = cKDTree(points).query(vertices, distance_upper_bound=trim)[0] <= trim
-    return _mesh(vertices, faces[near[faces].all(axis=1)])
+    return Mesh.compact(vertices, faces[near[faces].all(axis=1)])
 
 
 def terrain(points: np.ndarray, up: np.ndarray, longest: float) -> Mesh:
@@ -78,9 +78,4 @@ def terrain(points: np.ndarray, up: np.ndarray, longest: float) -> Mesh:
     faces = faces[sides <= longest]
     downward = measure.face_vectors(points, faces) @ up < 0
     faces[downward] = faces[downward][:, [0, 2, 1]]
-    return _mesh(points, faces)
-
-
-def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    vertices, faces = measure.compact(vertices, faces)
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+    return Mesh.compact(points, faces)

@@ -18,20 +18,15 @@ def weld(mesh: Mesh, distance: float) -> Mesh:
     flat = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
     faces = faces[~flat]
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return _mesh(means, faces[np.sort(first)])
+    return Mesh.compact(means, faces[np.sort(first)])
 
 
 def without_specks(mesh: Mesh, least_faces: int) -> Mesh:
     """Without connected pieces of fewer faces: they cost a chart each and show little."""
     piece = measure.vertex_components(mesh.faces, len(mesh.vertices))[mesh.faces[:, 0]]
-    return _mesh(mesh.vertices, mesh.faces[np.bincount(piece)[piece] >= least_faces])
+    return Mesh.compact(mesh.vertices, mesh.faces[np.bincount(piece)[piece] >= least_faces])
 
 
 def collapse(mesh: Mesh, target_faces: int) -> Mesh:
     """About ``target_faces`` faces by QSlim."""
-    return _mesh(*decimator.collapse(mesh.vertices, mesh.faces, target_faces, "fast_simplification", 0.0))
-
-
-def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    vertices, faces = measure.compact(np.asarray(vertices, np.float64), np.asarray(faces, np.int64))
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+    return Mesh.compact(*decimator.collapse(mesh.vertices, mesh.faces, target_faces, "fast_simplification", 0.0))

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from stages.graphics.cameras import Camera
-from stages.graphics.geometry import measure
 from stages.neuras.rasterizing.casting import Caster
 from stages.neuras.records import Mesh
 
@@ -33,8 +32,7 @@ def kept_faces(mesh: Mesh, visible: np.ndarray, rings: int) -> Mesh:
         touched = np.zeros(len(mesh.vertices), bool)
         touched[mesh.faces[visible]] = True
         visible = touched[mesh.faces].any(axis=1)
-    vertices, faces = measure.compact(mesh.vertices.astype(np.float64), mesh.faces[visible].astype(np.int64))
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+    return Mesh.compact(mesh.vertices, mesh.faces[visible])
 
 
 def carved(mesh: Mesh, points: np.ndarray, sensors: np.ndarray, slack: float, rounds: int = 4) -> Mesh:
@@ -58,8 +56,7 @@ def carved(mesh: Mesh, points: np.ndarray, sensors: np.ndarray, slack: float, ro
         empty = passed > stopped
         if not empty.any() or empty.all():
             break
-        vertices, faces = measure.compact(mesh.vertices.astype(np.float64), mesh.faces[~empty].astype(np.int64))
-        mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+        mesh = Mesh.compact(mesh.vertices, mesh.faces[~empty])
     return mesh
 
 
