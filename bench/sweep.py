@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from model.renderformer.losses import image_loss  # noqa: E402
 from model.renderformer.network import RenderFormer  # noqa: E402
 from model.renderformer.training import predict  # noqa: E402
-from model.training.optimization import optimizers  # noqa: E402
+from model.training.optimization import build_optimizers  # noqa: E402
 from pipeline.config import StageConfig  # noqa: E402
 from stages.renderformer.evaluation.ablation import jobs_of  # noqa: E402
 from tests.model.synthetic import batch  # noqa: E402
@@ -35,7 +35,7 @@ def step_seconds(train: StageConfig, resolution: int, triangles: int, repeats: i
     """(processor time, the first thread's, that of the optimizer) of a training step."""
     torch.manual_seed(0)
     model = RenderFormer(train.model.build()).train()
-    updates = optimizers(model, train.optimizer, train.lr, train.muon_lr, train.weight_decay)
+    updates = build_optimizers(model, train.optimizer, train.lr, train.muon_lr, train.weight_decay)
     data = batch(0, train.batch_scenes, triangles, train.views_per_scene, resolution)
     image = torch.from_numpy(data["image"])
     best = (float("inf"),) * 3

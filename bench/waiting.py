@@ -39,7 +39,7 @@ def train(variant: str, seconds: float) -> float:
     from model.renderformer.losses import image_loss
     from model.renderformer.network import RenderFormer
     from model.renderformer.training import predict
-    from model.training.optimization import optimizers
+    from model.training.optimization import build_optimizers
     from pipeline.hydra_config import compose
     from stages.renderformer.s06_train import TrainConfig
     from tests.model.synthetic import batch
@@ -49,7 +49,7 @@ def train(variant: str, seconds: float) -> float:
     torch.manual_seed(0)
     torch.set_flush_denormal(True)
     model = RenderFormer(config.model.build()).train()
-    updates = optimizers(model, config.optimizer, config.lr, config.muon_lr, config.weight_decay)
+    updates = build_optimizers(model, config.optimizer, config.lr, config.muon_lr, config.weight_decay)
     data = batch(0, config.batch_scenes, 430, config.views_per_scene, 64)
     image = torch.from_numpy(data["image"])
 

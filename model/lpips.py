@@ -91,15 +91,15 @@ class LPIPS(nn.Module):
 
     def _features(self, image: Tensor) -> list[Tensor]:
         x = (2 * image - 1 - self.shift) / self.scale
-        found = []
+        features = []
         for index, stage in enumerate(self.stages):
             x = stage(x)
             if isinstance(stage, nn.Conv2d):
                 x = F.relu(x)
             if index in self.compared:
                 # The tiny number under the root keeps its gradient finite where all features are 0.
-                found.append(x / (x.square().sum(dim=1, keepdim=True).add(1e-20).sqrt() + 1e-10))
-        return found
+                features.append(x / (x.square().sum(dim=1, keepdim=True).add(1e-20).sqrt() + 1e-10))
+        return features
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """(B, 3, H, W) in [0, 1] each -> (B,) distances."""

@@ -104,8 +104,8 @@ def attend_packed(q: Tensor, k: Tensor, v: Tensor, segments: Segments) -> Tensor
     what is thrown away, and sequences of a thousand tokens keep a device busy one by one.
     """
     parts = zip(*(segments.split(x, 1) for x in (q, k, v)), strict=True)
-    found = [attend(a[None], b[None], c[None])[0] for a, b, c in parts]
-    return found[0] if len(found) == 1 else torch.cat(found, dim=1)
+    outputs = [attend(a[None], b[None], c[None])[0] for a, b, c in parts]
+    return outputs[0] if len(outputs) == 1 else torch.cat(outputs, dim=1)
 
 
 @torch.compiler.disable
@@ -113,8 +113,8 @@ def attend_across(q: Tensor, k: Tensor, v: Tensor, segments: Segments) -> Tensor
     """Attention of rays (B V, heads, T, c) to their scene's packed tokens: k, v (V, heads, S, c), or 1 for V alike."""
     views = len(q) // len(segments)
     parts = zip(q.split(views), segments.split(k, 2), segments.split(v, 2), strict=True)
-    found = [attend(a, *(x.expand(views, -1, -1, -1) for x in (b, c))) for a, b, c in parts]
-    return found[0] if len(found) == 1 else torch.cat(found)
+    outputs = [attend(a, *(x.expand(views, -1, -1, -1) for x in (b, c))) for a, b, c in parts]
+    return outputs[0] if len(outputs) == 1 else torch.cat(outputs)
 
 
 class SelfAttention(nn.Module):

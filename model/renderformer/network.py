@@ -267,9 +267,9 @@ class RenderFormer(nn.Module):
         channels, patch = self.config.texture_channels, self.config.texture_encode_patch_size
         patches = scenes.patches
         if scenes.material.shape[1] != channels or (patches is not None and patches.shape[1:] != (channels, patch, patch)):
-            found = [tuple(x.shape) for x in (scenes.material, patches) if x is not None]
+            shapes = [tuple(x.shape) for x in (scenes.material, patches) if x is not None]
             raise InputError(
-                f"material has shape {', '.join(map(str, found))}: the model reads {channels} channels, "
+                f"material has shape {', '.join(map(str, shapes))}: the model reads {channels} channels, "
                 f"as one vector or a {patch} x {patch} patch per triangle"
             )
         encoder = self.texture_encoder

@@ -28,7 +28,7 @@ from model.renderformer.losses import image_loss, log_radiance
 from model.renderformer.network import RenderFormer, to_radiance
 from model.renderformer.recipe import FitConfig
 from model.training.logs import TrainingLog
-from model.training.optimization import Average, optimizers, schedule, set_learning_rate
+from model.training.optimization import Average, build_optimizers, schedule, set_learning_rate
 from model.training.parallel import Group, accumulating, distribute, gather, scatter
 from pipeline.atomic import atomic_path
 
@@ -147,7 +147,7 @@ class _State:
 
     def __init__(self, model: RenderFormer, config: FitConfig, folder: Path, group: Group):
         self.model, self.config, self.path, self.group = model, config, folder / STATE, group
-        self.optimizers = optimizers(model, config.optimizer, config.lr, config.muon_lr, config.weight_decay)
+        self.optimizers = build_optimizers(model, config.optimizer, config.lr, config.muon_lr, config.weight_decay)
         self.average = Average(model, config.ema) if config.ema else None
         self.step = 0  # steps done: also the position in the data
         self.skipped = 0
@@ -260,13 +260,13 @@ def fit(
 
     def validate() -> dict[str, float]:
         with state.averaged():
-            found, pairs = evaluate(model, validation, group, precision, config.pictures if show else 0)
-        if state.best is None or found["log_error"] < state.best:
-            state.best = found["log_error"]
+            scores, pairs = evaluate(model, validation, group, precision, config.pictures if show else 0)
+        if state.best is None or scores["log_error"] < state.best:
+            state.best = scores["log_error"]
             state.release(folder / BEST, trained_with)
         if pairs and group.leads:
             log.picture("validation/reference above, prediction below", show(state.step, pairs), state.step)
-        return found
+        return scores
 
     base_seconds, began = state.seconds, time.perf_counter()
     work.start()

@@ -21,7 +21,9 @@ def schedule(step: int, steps: int, warmup: int, decay_steps: int | None, final:
     return final + (1 - final) * 0.5 * (1 + math.cos(math.pi * progress))
 
 
-def optimizers(model: nn.Module, name: str, lr: float, muon_lr: float, weight_decay: float) -> list[torch.optim.Optimizer]:
+def build_optimizers(
+    model: nn.Module, name: str, lr: float, muon_lr: float, weight_decay: float
+) -> list[torch.optim.Optimizer]:
     """AdamW for all, or Muon for the transformer layers' matrices and AdamW for the rest.
 
     Norms, biases and tokens do not decay. Every group remembers its highest learning rate as ``peak_lr``.
@@ -36,19 +38,19 @@ def optimizers(model: nn.Module, name: str, lr: float, muon_lr: float, weight_de
     decayed = [p for key, p in rest if p.ndim >= 2 and "token" not in key]
     plain = [p for key, p in rest if not (p.ndim >= 2 and "token" not in key)]
     groups = [{"params": decayed, "weight_decay": weight_decay}, {"params": plain, "weight_decay": 0.0}]
-    found: list[torch.optim.Optimizer] = [torch.optim.AdamW([g for g in groups if g["params"]], lr=lr, betas=(0.9, 0.95))]
+    optimizers: list[torch.optim.Optimizer] = [torch.optim.AdamW([g for g in groups if g["params"]], lr=lr, betas=(0.9, 0.95))]
     if hidden:
         matrices = [p for key, p in named if key in hidden]
-        found.append(torch.optim.Muon(matrices, lr=muon_lr, weight_decay=weight_decay))
-    for optimizer in found:
+        optimizers.append(torch.optim.Muon(matrices, lr=muon_lr, weight_decay=weight_decay))
+    for optimizer in optimizers:
         for group in optimizer.param_groups:
             group["peak_lr"] = group["lr"]
-    return found
+    return optimizers
 
 
-def set_learning_rate(found: list[torch.optim.Optimizer], share: float) -> None:
+def set_learning_rate(optimizers: list[torch.optim.Optimizer], share: float) -> None:
     """``share`` of every group's highest learning rate."""
-    for optimizer in found:
+    for optimizer in optimizers:
         for group in optimizer.param_groups:
             group["lr"] = share * group["peak_lr"]
 

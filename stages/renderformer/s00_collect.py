@@ -151,31 +151,31 @@ class Collect(MapStage):
         for name, first in sorted(same.items()):
             left_out.setdefault(first, []).append(objects.pop(name)["content_hash"])
             draft.reject(rows[name].item, "duplicate", f"same geometry as {rows[first].item}")
-        held = {}
+        fixed_splits = {}
         if config.name == "procedural":
             of_family = {family: "test" for family in config.test_families}
             of_family |= {family: "validation" for family in config.validation_families}
-            held = {name: of_family[o["family"]] for name, o in objects.items() if o["family"] in of_family}
-        splits = catalogue.fill_splits(list(objects.values()), held, left_out)
+            fixed_splits = {name: of_family[o["family"]] for name, o in objects.items() if o["family"] in of_family}
+        splits = catalogue.fill_splits(list(objects.values()), fixed_splits, left_out)
         listed = [{**objects[name], "split": splits[name]} for name in sorted(objects)]
         (draft.files / "objects.json").write_bytes(pack_json(listed))
         if config.textures:
-            told = {}
+            textures_json = {}
             for name in sorted(objects):
                 id = name + TextureRecord.SUFFIX
                 members = draft.read(id).members if id in beside else {}
                 notes = unpack_json(members["notes.json"]) if "notes.json" in members else []
-                told[name] = {"textured": "texture.npz" in members, "notes": notes}
-            (draft.files / "textures.json").write_bytes(pack_json(told))
-            number = sum(entry["textured"] for entry in told.values())
-            draft.note("textures", {"textured": number, "plain": len(told) - number})
+                textures_json[name] = {"textured": "texture.npz" in members, "notes": notes}
+            (draft.files / "textures.json").write_bytes(pack_json(textures_json))
+            number = sum(entry["textured"] for entry in textures_json.values())
+            draft.note("textures", {"textured": number, "plain": len(textures_json) - number})
         draft.note(
             "summary",
             {
                 "objects": len(listed),
                 "splits": dict(sorted(Counter(splits.values()).items())),
                 "families": len({o["family"] for o in listed if o["family"]}),
-                "held_out": {o["family"]: splits[o["object_id"]] for o in listed if o["object_id"] in held},
+                "held_out": {o["family"]: splits[o["object_id"]] for o in listed if o["object_id"] in fixed_splits},
                 "duplicates": len(same),
                 "faces": catalogue.spread([o["faces"] for o in listed]),
                 "licences": dict(sorted(Counter(o["licence"] or "unknown" for o in listed).items())),
@@ -262,7 +262,7 @@ def mesh_files(config: FolderConfig) -> list[str]:
     from stages.graphics.geometry.load import SUFFIXES
 
     root = _folder(config)
-    found = []
+    mesh_paths = []
     for folder, folders, files in os.walk(root):
         folders.sort()
         for name in files:
@@ -270,10 +270,10 @@ def mesh_files(config: FolderConfig) -> list[str]:
             if relative.suffix.lower() in SUFFIXES and (
                 config.pattern == "**/*" or PurePosixPath(relative.as_posix()).match(config.pattern)
             ):
-                found.append(relative.as_posix())
-    if not found:
+                mesh_paths.append(relative.as_posix())
+    if not mesh_paths:
         raise UserError(f"collect.path={config.path!r} holds no mesh matching {config.pattern!r} ({', '.join(SUFFIXES)})")
-    return sorted(found)
+    return sorted(mesh_paths)
 
 
 def _hashes(config: FolderConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:

@@ -99,11 +99,11 @@ def folder_of(config: ImportConfig) -> Path:
 def scene_files(root: Path) -> list[str]:
     """Relative POSIX paths of the scene files below the folder, sorted. JSON files that are no scenes are passed over."""
     files = [path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()]
-    found = [path.relative_to(root).as_posix() for path in files]
-    found = sorted(name for name in found if not name.lower().endswith(".json") or is_scene(root / name))
-    if not found:
+    names = [path.relative_to(root).as_posix() for path in files]
+    scenes = sorted(name for name in names if not name.lower().endswith(".json") or is_scene(root / name))
+    if not scenes:
         raise UserError(f"scene.path={str(root)!r} holds no scene ({', '.join(SUFFIXES)} in the released formats)")
-    return found
+    return scenes
 
 
 def is_scene(path: Path) -> bool:
@@ -128,10 +128,10 @@ def meshes_of(path: Path) -> list[Path]:
         return []
     try:
         names = [entry["mesh_path"] for entry in json.loads(path.read_bytes())["objects"].values()]
-        found = [(path.parent / name).resolve() for name in names]
+        mesh_paths = [(path.parent / name).resolve() for name in names]
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return []
-    return [mesh for mesh in found if mesh.is_relative_to(path.parent.resolve()) and mesh.is_file()]
+    return [mesh for mesh in mesh_paths if mesh.is_relative_to(path.parent.resolve()) and mesh.is_file()]
 
 
 def split_of(relative: str, otherwise: str) -> str:

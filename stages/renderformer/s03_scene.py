@@ -146,15 +146,15 @@ class SceneWorker:
             else:
                 entry = entries[placement.index]
                 meshes.append(self.mesh(entry, rung))
-                told = ("object_id", "content_hash", "family", "source", "origin", "licence")
-                chosen.append({"rung": rung, **{name: entry.get(name) for name in told}})
+                origin_fields = ("object_id", "content_hash", "family", "source", "origin", "licence")
+                chosen.append({"rung": rung, **{name: entry.get(name) for name in origin_fields}})
             if placement.texture is not None:
-                found = self.pattern(placement, meshes[-1]) if placement.shape else self.colours(entry, rung)
-                chosen[-1]["textured"] = found is not None
-                if found is None:  # no base colours: it stays as it is without textures
+                base_colours = self.pattern(placement, meshes[-1]) if placement.shape else self.colours(entry, rung)
+                chosen[-1]["textured"] = base_colours is not None
+                if base_colours is None:  # no base colours: it stays as it is without textures
                     placement.texture = None
                 else:
-                    colours[placement.name] = found
+                    colours[placement.name] = base_colours
         patches = {
             p.name: material_patches(colours[p.name], p.material.bound, p.material.specular, p.material.roughness)
             for p in (*plan.walls, *plan.objects)

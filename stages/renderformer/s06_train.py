@@ -210,9 +210,9 @@ def name_damaged(
 def initial_folder(reference: str) -> Path:
     """The checkpoint folder that ``train.init_from`` names: itself, or inside a train artifact's folder."""
     folder = Path(reference).expanduser()
-    for found in (folder, folder / "files" / "checkpoint"):
-        if (found / "config.json").is_file() and (found / "model.safetensors").is_file():
-            return found
+    for candidate in (folder, folder / "files" / "checkpoint"):
+        if (candidate / "config.json").is_file() and (candidate / "model.safetensors").is_file():
+            return candidate
     raise UserError(
         f"train.init_from={reference} holds no checkpoint: give a folder with config.json and model.safetensors, or that of a "
         "finished train artifact (store/train/...)"
@@ -239,8 +239,10 @@ class TrainingObjects:
         if not (folder / OBJECTS).is_file():
             return cls({}, complete=False)
         try:
-            found = json.loads((folder / OBJECTS).read_bytes())
-            return cls({str(id): str(content) for id, content in found["objects"].items()}, bool(found["complete"]))
+            objects_json = json.loads((folder / OBJECTS).read_bytes())
+            return cls(
+                {str(id): str(content) for id, content in objects_json["objects"].items()}, bool(objects_json["complete"])
+            )
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise UserError(
                 f"{folder / OBJECTS} is no list of training objects ({error}): expected objects, complete"

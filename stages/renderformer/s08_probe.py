@@ -92,10 +92,10 @@ class RunProbe(MapStage):
         probe = PROBES[config.name]
         outcome = probe.finish(worker, draft)
         if {"triangles", "resolution"} <= worker.trained_with.keys():
-            seen = worker.trained_with
-            outcome.notes.append(f"Trained with scenes of at most {seen['triangles']} triangles, at {seen['resolution']} px.")
+            triangles, resolution = worker.trained_with["triangles"], worker.trained_with["resolution"]
+            outcome.notes.append(f"Trained with scenes of at most {triangles} triangles, at {resolution} px.")
         outcome.figure.savefig(draft.files / "figure.png", metadata={"Software": None})
-        told = {
+        probe_json = {
             "name": probe.name,
             "title": probe.title,
             "question": probe.question,
@@ -105,7 +105,7 @@ class RunProbe(MapStage):
             "rows": outcome.rows,
             "notes": outcome.notes,
         }
-        (draft.files / "probe.json").write_text(json.dumps(told, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        (draft.files / "probe.json").write_text(json.dumps(probe_json, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
         (draft.files / "table.md").write_text(markdown(probe, outcome), encoding="utf-8")
         draft.note("probe", {"question": probe.question, "notes": outcome.notes})
         for note in outcome.notes:

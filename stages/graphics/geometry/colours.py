@@ -134,14 +134,14 @@ def _read(path: Path, max_bytes: int) -> bytes:
 
 def side_files(path: Path, root: Path) -> list[Path]:
     """The material libraries and images beside a mesh file that decide its colours; what is unsafe or missing is left out."""
-    found: set[Path] = set()
+    files: set[Path] = set()
 
     def add(uri: str, suffixes: Any) -> Path | None:
         try:
             target = side_file(uri, path.parent, root, suffixes)
         except (Reject, ValueError, OSError):
             return None
-        found.add(target)
+        files.add(target)
         return target
 
     try:
@@ -160,7 +160,7 @@ def side_files(path: Path, root: Path) -> list[Path]:
                     add(image["uri"], IMAGE_FORMATS)
     except (Reject, ValueError, OSError, AttributeError, TypeError, KeyError, IndexError, struct.error):
         pass  # the file itself is rejected when it is read
-    return sorted(found)
+    return sorted(files)
 
 
 # -- OBJ
@@ -197,7 +197,7 @@ def parse_library(data: bytes) -> dict[str, dict[str, Any]]:
 def obj_materials(data: bytes, folder: Path, root: Path, max_bytes: int, images: Images) -> dict[str, Material]:
     """Material name -> base colour, as the libraries of an OBJ say. Kd counts only where there is no image, as exporters
     leave anything in it beside one."""
-    found: dict[str, Material] = {}
+    material_by_name: dict[str, Material] = {}
     for name in library_names(data):
         try:
             library = parse_library(_read(side_file(name, folder, root, (LIBRARY_SUFFIX,)), max_bytes))
@@ -211,8 +211,8 @@ def obj_materials(data: bytes, folder: Path, root: Path, max_bytes: int, images:
                 image = images.get(uri, lambda uri=uri: _read(side_file(uri, folder, root, IMAGE_FORMATS), max_bytes))
             colour = (1.0, 1.0, 1.0) if image is not None else stated.get("colour", (1.0, 1.0, 1.0))
             wrap = stated.get("wrap", "repeat")
-            found.setdefault(key, Material(colour, image, (wrap, wrap), np.array([[1.0, 0, 0], [0, -1, 1]])))
-    return found
+            material_by_name.setdefault(key, Material(colour, image, (wrap, wrap), np.array([[1.0, 0, 0], [0, -1, 1]])))
+    return material_by_name
 
 
 def library_without_images(names: Any) -> bytes:
@@ -301,17 +301,17 @@ def texture_record(id: str, parts: list[tuple[Material, np.ndarray | None, int]]
     for (look, uv, _), start, end in zip(parts, ends, ends[1:], strict=False):
         if start == end:
             continue
-        mine = slice(start, end)
+        part_faces = slice(start, end)
         image, wrap = -1, (0, 0)
         if uv is not None and look.image is not None:
             image = images.setdefault(look.picture, len(pictures))
             if image == len(pictures):
                 pictures.append(look.image)
             wrap = tuple(TextureRecord.WRAPS.index(name) for name in look.wrap)
-            coordinates[mine] = coordinates[mine] @ look.transform[:, :2].T + look.transform[:, 2]
+            coordinates[part_faces] = coordinates[part_faces] @ look.transform[:, :2].T + look.transform[:, 2]
         else:
-            coordinates[mine] = 0
-        material[mine] = rows.setdefault((look.colour, image, wrap), len(rows))
+            coordinates[part_faces] = 0
+        material[part_faces] = rows.setdefault((look.colour, image, wrap), len(rows))
     if not pictures and len(rows) < 2:
         return None
     colour, image, wrap = zip(*rows, strict=True)

@@ -235,14 +235,14 @@ class Reference:
         """distance: mean of the two directed mean distances; kept: share of the outer surface within 1 %; inside: share
         of the result's area that no ray from outside reaches; flipped: share of rays from outside that meet a back
         first."""
-        there = distances(self.points, vertices, faces) / self.diagonal
+        forward = distances(self.points, vertices, faces) / self.diagonal
         points, normals = sample(vertices, faces, len(self.points))
-        back = distances(points, self.vertices, self.faces) / self.diagonal
+        backward = distances(points, self.vertices, self.faces) / self.diagonal
         visibility = Visibility(vertices, faces)
         seen = visibility.outer(points, normals, two_sided=False)
         return {
-            "distance": round(float(there.mean() + back.mean()) / 2, 6),
-            "kept": round(float((there < 0.01).mean()), 4),
+            "distance": round(float(forward.mean() + backward.mean()) / 2, 6),
+            "kept": round(float((forward < 0.01).mean()), 4),
             "inside": round(float(1 - seen.mean()), 4),
             "flipped": round(visibility.flipped(points[:: max(1, len(points) // 64)]), 4),
         }

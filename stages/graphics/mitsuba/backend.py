@@ -49,19 +49,19 @@ log = logging.getLogger("lightmill")
 
 def llvm_libraries() -> list[str]:
     """Paths of the libLLVM here, DRJIT_LIBLLVM_PATH first, then the newest first."""
-    found = set()
+    paths = set()
     for folder in FOLDERS:
         for name in ("libLLVM*.so*", "libLLVM*.dylib"):
-            found |= {os.path.realpath(path) for path in glob.glob(os.path.join(folder, name))}
+            paths |= {os.path.realpath(path) for path in glob.glob(os.path.join(folder, name))}
     ldconfig = shutil.which("ldconfig") or "/sbin/ldconfig"
     if os.path.exists(ldconfig):
         listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, check=False).stdout
-        found |= {os.path.realpath(path) for path in re.findall(r"=> (\S*libLLVM\S*)", listing)}
+        paths |= {os.path.realpath(path) for path in re.findall(r"=> (\S*libLLVM\S*)", listing)}
 
     def version(path: str) -> tuple[list[int], str]:
         return [int(number) for number in re.findall(r"\d+", os.path.basename(path))], path
 
-    ordered = sorted((path for path in found if os.path.isfile(path)), key=version, reverse=True)
+    ordered = sorted((path for path in paths if os.path.isfile(path)), key=version, reverse=True)
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     return ([named] if named else []) + [path for path in ordered if path != named]
 
@@ -70,8 +70,8 @@ def llvm_version(path: str) -> int | None:
     """The major version that the path of a libLLVM names (libLLVM-15.so.1, libLLVM.so.19.1, llvm-19/lib/libLLVM.so); the
     links of a file that is there are followed. None where none does."""
     real = os.path.realpath(path)
-    found = re.search(r"\d+", os.path.basename(real)) or re.search(r"(?<=llvm[-@/])\d+", real)
-    return int(found[0]) if found else None
+    digits = re.search(r"\d+", os.path.basename(real)) or re.search(r"(?<=llvm[-@/])\d+", real)
+    return int(digits[0]) if digits else None
 
 
 def llvm_backend(path: str) -> dict[str, Any]:
@@ -124,15 +124,15 @@ def claim_gpu() -> None:
 
 def candidates(choice: str) -> list[dict[str, Any]]:
     """Backends to try for a choice of the config, best first."""
-    found: list[dict[str, Any]] = []
+    backends: list[dict[str, Any]] = []
     if choice in ("auto", "cuda") and visible_gpus():
-        found.append({"backend": "cuda"})
+        backends.append({"backend": "cuda"})
     if choice in ("auto", "llvm"):
         libraries = [llvm_backend(path) for path in llvm_libraries() if os.path.isfile(path)]
-        found += [backend for number, backend in enumerate(libraries) if backend not in libraries[:number]]
+        backends += [backend for number, backend in enumerate(libraries) if backend not in libraries[:number]]
     if choice in ("auto", "scalar"):
-        found.append({"backend": "scalar"})
-    return found
+        backends.append({"backend": "scalar"})
+    return backends
 
 
 def works(candidate: dict[str, Any]) -> bool:

@@ -113,8 +113,8 @@ def check_source(source: str, kind: str) -> None:
     inside = source.startswith(f"data:{kind}/")
     beside = not re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*:|[/\\]", source) and ".." not in re.split(r"[/\\]", source)
     if not source or not (inside or beside):
-        shown = source if len(source) <= 80 else source[:80] + ".."
-        raise ValueError(f"{shown!r}: a page's {kind} is a data URI or a file in the page's own folder")
+        excerpt = source if len(source) <= 80 else source[:80] + ".."
+        raise ValueError(f"{excerpt!r}: a page's {kind} is a data URI or a file in the page's own folder")
 
 
 def embed(data: bytes, media_type: str = "image/png") -> str:

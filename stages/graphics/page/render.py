@@ -36,5 +36,5 @@ def inline(text: str) -> Markup:
 
 def headings(content: str) -> list[tuple[str, Markup]]:
     """(anchor, heading) of every section in a page's HTML, for its table of contents."""
-    found = re.findall(r'<section id="([^"]+)">\s*<h2>(.*?)</h2>', str(content), re.S)
-    return [(anchor, Markup(heading)) for anchor, heading in found]
+    anchored = re.findall(r'<section id="([^"]+)">\s*<h2>(.*?)</h2>', str(content), re.S)
+    return [(anchor, Markup(heading)) for anchor, heading in anchored]

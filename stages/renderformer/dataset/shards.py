@@ -272,10 +272,10 @@ class ShardDataset:
                 image, aov = view_members(view)
                 where = f"{image} of {row['id']}"
                 lights, meta = self._cached((index, image, dtype), lambda n=image, w=where: decode_lights(reader[n], w, dtype))
-                found = {}
+                layer_images = {}
                 if layers:
-                    found = self._cached((index, aov, dtype), lambda n=aov, w=where: decode_layers(reader[n], w, dtype))
-                out[view] = _view(lights, meta, found)
+                    layer_images = self._cached((index, aov, dtype), lambda n=aov, w=where: decode_layers(reader[n], w, dtype))
+                out[view] = _view(lights, meta, layer_images)
         return Sample(scene, out)
 
     def _cached(self, key: tuple, decode: Any) -> Any:
@@ -314,13 +314,13 @@ class ShardDataset:
 
     def _check(self, name: str, path: Path, size: int) -> None:
         try:
-            there = os.stat(path).st_size
+            actual_size = os.stat(path).st_size
         except (FileNotFoundError, NotADirectoryError):
-            there = None
-        if there != size:
-            what = "is missing" if there is None else f"has {there:,} bytes, not {size:,}"
+            actual_size = None
+        if actual_size != size:
+            problem = "is missing" if actual_size is None else f"has {actual_size:,} bytes, not {size:,}"
             raise DamagedShard(
-                f"the shard {path} {what}: fetch it again or make it again (lightmill verify), "
+                f"the shard {path} {problem}: fetch it again or make it again (lightmill verify), "
                 "or set skip_damaged_shards (train.skip_damaged_shards=true) to go on without its samples"
             )
 

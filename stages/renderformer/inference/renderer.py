@@ -265,11 +265,11 @@ def earlier_frames(folder: Path) -> list[Path]:
         return []
     if not folder.is_dir():
         raise UserError(f"{folder} is a file, and the video's frames go into a folder of that name: give another -o")
-    found = sorted(folder.iterdir())
-    for path in found:
+    entries = sorted(folder.iterdir())
+    for path in entries:
         if not re.fullmatch(r"[0-9]{4,}\.png", path.name):
             raise UserError(f"{folder} is for the video's frames and holds {path.name}: give another -o, or empty it")
-    return found
+    return entries
 
 
 def write_png(path: Path, picture: np.ndarray) -> None:

@@ -111,7 +111,7 @@ class Attention(Probe):
         side = config.resolution // patch
         tiles = view.triangle.reshape(side, patch, side, patch).swapaxes(1, 2).reshape(side * side, -1)
         lit = scene.light_index >= 0
-        told = []
+        weight_rows = []
         for number, bundle in enumerate(bundles):
             own = np.unique(tiles[bundle])
             own = own[own >= 0]
@@ -119,7 +119,7 @@ class Attention(Probe):
             on_object = scene.meta["objects"][np.bincount(objects).argmax()]["name"] if len(objects) else "nothing"
             for layer, row in enumerate(weights[:, number]):
                 on = row[registers:]
-                told.append(
+                weight_rows.append(
                     {
                         "bundle": number,
                         "on": on_object,  # what most of its pixels see
@@ -130,7 +130,7 @@ class Attention(Probe):
                         "effective": float(np.exp(-np.sum(row * np.log(np.maximum(row, 1e-12))))),
                     }
                 )
-        facts = {"scene": item.id, "bundles": bundles, "triangles": len(scene.triangles), "weights": told}
+        facts = {"scene": item.id, "bundles": bundles, "triangles": len(scene.triangles), "weights": weight_rows}
         arrays = {"weights": weights[:, :, registers:].astype(np.float32), "triangle": drawn.astype(np.int32)}
         members = {"reference.exr": encode_rgb(view.image), "prediction.exr": encode_rgb(prediction)}
         yield Record(
@@ -184,19 +184,19 @@ class Attention(Probe):
             seen = arrays["triangle"]
             for number, bundle in enumerate(fact["bundles"]):
                 row, column = divmod(bundle, config.resolution // patch)
-                told = [entry for entry in fact["weights"] if entry["bundle"] == number]
+                bundle_rows = [entry for entry in fact["weights"] if entry["bundle"] == number]
                 for place, (name, image) in enumerate((("path traced", target), ("predicted", prediction))):
                     axes = figure.add_subplot(grid[line, place])
-                    show_picture(axes, to_picture(image, exposure), name, "" if place else f"bundle on {told[0]['on']}")
+                    show_picture(axes, to_picture(image, exposure), name, "" if place else f"bundle on {bundle_rows[0]['on']}")
                     box = (column * patch - 0.5, row * patch - 0.5)
                     axes.add_patch(Rectangle(box, patch, patch, fill=False, edgecolor="#00d0ff", linewidth=1.6))
                 scale = config.drawn_px / config.resolution
                 for place, layer in enumerate(layers):
                     weights = arrays["weights"][layer, number]
                     top = float(weights[np.unique(seen[seen >= 0])].max(initial=1e-12))
-                    lights = 100 * next(entry["lights"] for entry in told if entry["layer"] == layer)
-                    shown = np.where(seen >= 0, weights[seen] / top, 0)
-                    pixels = colours(np.clip(shown, 0, 1) ** 0.5, bytes=True)[..., :3].copy()
+                    lights = 100 * next(entry["lights"] for entry in bundle_rows if entry["layer"] == layer)
+                    relative_weights = np.where(seen >= 0, weights[seen] / top, 0)
+                    pixels = colours(np.clip(relative_weights, 0, 1) ** 0.5, bytes=True)[..., :3].copy()
                     pixels[seen < 0] = 255
                     axes = figure.add_subplot(grid[line, 2 + place])
                     show_picture(axes, pixels, f"layer {layer + 1}, top {100 * top:.2g} %\non lights {lights:.0f} %")

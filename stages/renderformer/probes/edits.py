@@ -146,11 +146,11 @@ def lights_at(scene: SceneRecord, distance: float) -> SceneRecord:
     corners, radiance = _emitters(scene)
     number = scene.light_index[scene.light_index >= 0]
     for light in np.unique(number):
-        mine = number == light
-        centre = corners[mine].mean(axis=(0, 1))
+        of_light = number == light
+        centre = corners[of_light].mean(axis=(0, 1))
         now = max(float(np.linalg.norm(centre)), 1e-9)
-        corners[mine] += centre * (distance / now - 1)
-        radiance[mine] *= (distance / now) ** 2
+        corners[of_light] += centre * (distance / now - 1)
+        radiance[of_light] *= (distance / now) ** 2
     return _relit(scene, corners, radiance)
 
 
@@ -159,9 +159,9 @@ def larger_lights(scene: SceneRecord, factor: float) -> SceneRecord:
     corners, radiance = _emitters(scene)
     number = scene.light_index[scene.light_index >= 0]
     for light in np.unique(number):
-        mine = number == light
-        centre = corners[mine].mean(axis=(0, 1))
-        corners[mine] = centre + factor * (corners[mine] - centre)
+        of_light = number == light
+        centre = corners[of_light].mean(axis=(0, 1))
+        corners[of_light] = centre + factor * (corners[of_light] - centre)
     return _relit(scene, corners, radiance / factor**2)
 
 
@@ -198,14 +198,14 @@ def bisected(scene: SceneRecord, count: int) -> SceneRecord:
         middle = corners[:, :2].mean(axis=1)
         normal = normals[:, :2].sum(axis=1)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-        both = rows(scene, np.concatenate([np.arange(len(size)), chosen]))
+        doubled = rows(scene, np.concatenate([np.arange(len(size)), chosen]))
         for first, keep in ((chosen, 0), (np.arange(len(size), len(size) + wanted), 1)):
             # corner 0 or 1 stays, the other of the two becomes the middle
-            for array, values, new in ((both.triangles, corners, middle), (both.vertex_normals, normals, normal)):
+            for array, values, new in ((doubled.triangles, corners, middle), (doubled.vertex_normals, normals, normal)):
                 half = values.copy()
                 half[:, 1 - keep] = new
                 array[first] = half
-        scene = both
+        scene = doubled
     return scene
 
 
@@ -236,17 +236,17 @@ def with_rung(scene: SceneRecord, name: str, now: meshes.Mesh, new: meshes.Mesh,
     vertices = place((new[0].astype(np.float64) - centre) * (0.5 / radius), placement)
     smooth = placement.material.smooth
     groups = meshes.shading_groups(vertices, faces, crease_deg) if smooth else np.arange(len(faces))
-    mine = scene.object_index == index
-    first = int(np.flatnonzero(mine)[0])
-    weights = areas(scene.triangles[mine])
-    order = np.concatenate([np.flatnonzero(~mine & (np.arange(len(mine)) < first)), np.full(len(faces), first)])
-    order = np.concatenate([order, np.flatnonzero(~mine & (np.arange(len(mine)) > first))])
+    of_object = scene.object_index == index
+    first = int(np.flatnonzero(of_object)[0])
+    weights = areas(scene.triangles[of_object])
+    order = np.concatenate([np.flatnonzero(~of_object & (np.arange(len(of_object)) < first)), np.full(len(faces), first)])
+    order = np.concatenate([order, np.flatnonzero(~of_object & (np.arange(len(of_object)) > first))])
     out = rows(scene, order)
-    part = slice(int((~mine[:first]).sum()), int((~mine[:first]).sum()) + len(faces))
+    part = slice(int((~of_object[:first]).sum()), int((~of_object[:first]).sum()) + len(faces))
     out.triangles[part] = vertices[faces]
     out.vertex_normals[part] = meshes.smooth_normals(vertices, faces, groups)
     for array in ("diffuse", "specular", "roughness"):
-        getattr(out, array)[part] = np.average(getattr(scene, array)[mine], axis=0, weights=weights)
+        getattr(out, array)[part] = np.average(getattr(scene, array)[of_object], axis=0, weights=weights)
     entries = list(scene.meta["objects"])
     entries[index] = {**entry, "faces": len(faces)}
     return replace(out, meta={**scene.meta, "objects": entries})
@@ -275,10 +275,10 @@ def patterned(scene: SceneRecord, repeats: float, rng: np.random.Generator) -> S
         uv = box_coordinates(corners.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), repeats)
         bound = float(scene.diffuse[faces].max())
         specular, roughness = float(scene.specular[faces].mean()), float(scene.roughness[faces].mean())
-        made = material_patches(bake(image, uv), bound, specular, roughness)
+        object_patches = material_patches(bake(image, uv), bound, specular, roughness)
         patch_index[faces] = sum(map(len, patches)) + np.arange(len(faces))
-        patches.append(made)
-        for name, values in patch_means(made).items():
+        patches.append(object_patches)
+        for name, values in patch_means(object_patches).items():
             means[name][faces] = values
     return replace(scene, **means, patch_index=patch_index, patches=np.concatenate(patches))
 

@@ -46,10 +46,11 @@ def strip(figure: Figure, where: object, rows: Sequence[tuple[str, Sequence[np.n
 
 
 def curve(
-    axes: object, x: Sequence[float], found: Sequence[Mapping[str, float]], label: str, colour: str, line: str = "-"
+    axes: object, x: Sequence[float], estimates: Sequence[Mapping[str, float]], label: str, colour: str, line: str = "-"
 ) -> None:
     """Means over ``x`` with their intervals."""
-    mean, low, high = (np.array([row[key] for row in found], float) for key in ("mean", "low", "high"))  # None: nan, not drawn
+    # a missing end (None) becomes nan, which is not drawn
+    mean, low, high = (np.array([row[key] for row in estimates], float) for key in ("mean", "low", "high"))
     axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
     axes.plot(x, mean, line, color=colour, marker="o", markersize=4, linewidth=1.6, label=label)
 

@@ -247,18 +247,20 @@ class Sweep(Probe):
 
         config = worker.config
         rows = [unpack_json(draft.read(row.id, ("metrics.json",)).members["metrics.json"]) for row in draft.rows()]
-        found = {(row["scene"], row["value"]): {**row, "id": id.id} for row, id in zip(rows, draft.rows(), strict=True)}
-        asked = {row["scene"] for row in rows} | {reject["item"].rpartition("-")[0] for reject in draft.rejects()}
-        whole = [scene for scene in sorted(asked) if all((scene, value) in found for value in config.values)]
-        if not whole:
+        row_by_case = {(row["scene"], row["value"]): {**row, "id": id.id} for row, id in zip(rows, draft.rows(), strict=True)}
+        all_scenes = {row["scene"] for row in rows} | {reject["item"].rpartition("-")[0] for reject in draft.rejects()}
+        complete_scenes = [
+            scene for scene in sorted(all_scenes) if all((scene, value) in row_by_case for value in config.values)
+        ]
+        if not complete_scenes:
             raise UserError(
                 f"probe={self.name}: no scene is left that could be rendered at every value (dark, or the camera inside an "
                 "object): use more scenes (probe.scenes) or other probe.values"
             )
-        methods = found[whole[0], config.values[0]]["methods"]
+        methods = row_by_case[complete_scenes[0], config.values[0]]["methods"]
 
         def scores(method: str, value: float, metric: str) -> list[float]:
-            return [found[scene, value]["scores"][method][metric] for scene in whole]
+            return [row_by_case[scene, value]["scores"][method][metric] for scene in complete_scenes]
 
         summary = {
             (method, value, metric): bootstrap([[score] for score in scores(method, value, metric)], metric_of(metric).bounds)
@@ -268,7 +270,7 @@ class Sweep(Probe):
         }
 
         def mean(name: str, value: float) -> float:
-            return float(np.mean([found[scene, value][name] for scene in whole]))
+            return float(np.mean([row_by_case[scene, value][name] for scene in complete_scenes]))
 
         facts = [
             name
@@ -284,12 +286,12 @@ class Sweep(Probe):
                 cells += [f"{mean(name, value):,.0f}" for name in facts]
                 cells += [interval(name, summary[method, value, name]) for name in SHOWN]
                 table.append(cells)
-        shown = whole[: max(1, 4 // (1 + len(methods)))]
+        drawn_scenes = complete_scenes[: max(1, 4 // (1 + len(methods)))]
 
         def picture(scene: str, value: float, member: str) -> np.ndarray:
             from stages.graphics.exr import decode_rgb
 
-            return decode_rgb(draft.read(found[scene, value]["id"], (member,)).members[member])
+            return decode_rgb(draft.read(row_by_case[scene, value]["id"], (member,)).members[member])
 
         figure = sweep_figure(
             self.setting,
@@ -298,15 +300,15 @@ class Sweep(Probe):
             methods,
             {scene: [[picture(scene, v, "reference.exr") for v in config.values]]
              + [[picture(scene, v, f"method{n}.exr") for v in config.values] for n in range(len(methods))]
-             for scene in shown},
+             for scene in drawn_scenes},
             {name: {m: [summary[m, v, name] for v in config.values] for m in methods} for name in CURVES},
             self.trained(worker.trained_with),
             self.axis,
             HEADINGS,
         )  # fmt: skip
-        notes = [f"{len(whole)} {self.scope(config)}; 95 % intervals over scenes."]
-        if len(whole) < len(asked):
-            left = len(asked) - len(whole)
+        notes = [f"{len(complete_scenes)} {self.scope(config)}; 95 % intervals over scenes."]
+        if len(complete_scenes) < len(all_scenes):
+            left = len(all_scenes) - len(complete_scenes)
             notes.append(f"{left} scene(s) left out: dark, or the camera too close to something, at one of the values.")
         errors = [row["error"] for row in rows if row["error"] is not None]
         if errors:
@@ -360,11 +362,11 @@ def span(numbers: Sequence[int]) -> str:
     return " to ".join(f"{number:,}" for number in sorted({min(numbers), max(numbers)}))
 
 
-def interval(name: str, found: Mapping[str, float]) -> str:
+def interval(name: str, estimate: Mapping[str, float]) -> str:
     """A metric's mean and its interval as text."""
     from stages.graphics.statistics import with_interval
 
-    return with_interval(found, metric_of(name).format)
+    return with_interval(estimate, metric_of(name).format)
 
 
 def metric_of(name: str) -> Metric:

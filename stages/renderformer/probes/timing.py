@@ -267,15 +267,15 @@ class EqualTime(Probe):
         def summary(get: Callable[[dict], dict[str, float]]) -> dict[str, dict[str, float]]:
             return {metric: bootstrap([[get(fact)[metric]] for fact in facts], metric_of(metric).bounds) for metric in SHOWN}
 
-        found: dict[tuple[str, float | None], dict] = {("network", None): summary(lambda fact: fact["model"])}
+        estimates: dict[tuple[str, float | None], dict] = {("network", None): summary(lambda fact: fact["model"])}
         for method, spp in traced_s:
-            found[method, spp] = summary(lambda fact, m=method, s=spp: fact["traced"][m][slug(s)])
+            estimates[method, spp] = summary(lambda fact, m=method, s=spp: fact["traced"][m][slug(s)])
         times = {("network", None): model_s, **traced_s}
         columns = ["method", "samples per pixel", "seconds", *(HEADINGS[name] for name in SHOWN)]
         rows = [
             [method, "" if spp is None else f"{spp:g}", f"{times[method, spp]:.3f}"]
-            + [interval(name, found[method, spp][name]) for name in SHOWN]
-            for method, spp in found
+            + [interval(name, estimates[method, spp][name]) for name in SHOWN]
+            for method, spp in estimates
         ]
         # the sample count whose time is nearest to the network's
         equal = {
@@ -283,12 +283,12 @@ class EqualTime(Probe):
         }
         titles = ["reference", f"network,\n{model_s:.3f} s"]
         titles += [f"{m},\n{s:g} samples, {traced_s[m, s]:.3f} s" for m, s in equal.items()]
-        shown = ids[:2]
+        drawn_ids = ids[:2]
         side = (LEAST_WIDTH - 0.3) / len(titles)
-        figure = new_figure(len(shown) * (side + 0.05) + 0.6 + 3.0, LEAST_WIDTH)
-        outer = figure.add_gridspec(2, 1, height_ratios=[len(shown) * (side + 0.05) + 0.6, 3.0])
-        pictures = outer[0].subgridspec(len(shown), 1)
-        for number, id in enumerate(shown):
+        figure = new_figure(len(drawn_ids) * (side + 0.05) + 0.6 + 3.0, LEAST_WIDTH)
+        outer = figure.add_gridspec(2, 1, height_ratios=[len(drawn_ids) * (side + 0.05) + 0.6, 3.0])
+        pictures = outer[0].subgridspec(len(drawn_ids), 1)
+        for number, id in enumerate(drawn_ids):
             record = draft.read(id)
             names = ["reference.exr", "prediction.exr"]
             names += [f"traced{n}.s{slug(spp)}.exr" for n, spp in enumerate(equal.values())]
@@ -296,12 +296,12 @@ class EqualTime(Probe):
             strip(figure, pictures[number], [("", images)], titles if number == 0 else [""] * len(titles))
         axes = figure.add_subplot(outer[1])
         for (method, _), colour in zip(TRACED.items(), COLOURS[1:], strict=False):
-            line = [(traced_s[method, spp], found[method, spp]["log_error"]) for spp in config.values]
+            line = [(traced_s[method, spp], estimates[method, spp]["log_error"]) for spp in config.values]
             x, y = [seconds for seconds, _ in line], [row["mean"] for _, row in line]
             axes.plot(x, y, color=colour, marker="o", markersize=4, linewidth=1.6, label=method)
             for at in (0, -1):
                 axes.annotate(f"{config.values[at]:g}", (x[at], y[at]), (3, 4), textcoords="offset points", fontsize=7)
-        model = found["network", None]["log_error"]
+        model = estimates["network", None]["log_error"]
         low = model["low"]
         error = None if low is None else [[model["mean"] - low], [model["high"] - model["mean"]]]
         axes.errorbar([model_s], [model["mean"]], error, color=COLOURS[0], marker="s", capsize=3, label="network")

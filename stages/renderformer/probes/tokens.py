@@ -111,8 +111,8 @@ class Tokens(Probe):
         rows = []
         for name, by_scene in decoded.items():
             errors = {id: errors_of(by_scene[id], truth[id]["radiance"], truth[id]["met"]) for id in held}
-            found = [bootstrap([[errors[id][part]] for id in held], METRICS["log_error"].bounds) for part in range(3)]
-            rows.append([name, *(with_interval(value, "{:.4f}".format) for value in found)])
+            estimates = [bootstrap([[errors[id][part]] for id in held], METRICS["log_error"].bounds) for part in range(3)]
+            rows.append([name, *(with_interval(value, "{:.4f}".format) for value in estimates)])
         columns = [self.setting, "log error of texels", "of triangles' means", "of what varies within triangles"]
         fitted, judged = (sum(int(truth[id]["met"].any(axis=(1, 2)).sum()) for id in ids) for ids in (fit, held))
         notes = [
@@ -199,13 +199,14 @@ def means(radiance: np.ndarray, met: np.ndarray) -> np.ndarray:
     return (radiance * weights).sum(axis=(1, 2), keepdims=True) / np.maximum(weights.sum(axis=(1, 2), keepdims=True), 1)
 
 
-def errors_of(found: np.ndarray, truth: np.ndarray, met: np.ndarray) -> tuple[float, float, float]:
+def errors_of(predicted: np.ndarray, truth: np.ndarray, met: np.ndarray) -> tuple[float, float, float]:
     """Mean absolute error of (T, P, P, 3) log radiance: of texels, of triangles' means, and of what is left of both
     without their means. Every texel weighs the same, and so every triangle by its texels."""
-    found, truth = found.astype(np.float32), truth.astype(np.float32)
-    a, b, counts = means(found, met), means(truth, met), met.sum(axis=(1, 2))
+    predicted, truth = predicted.astype(np.float32), truth.astype(np.float32)
+    a, b, counts = means(predicted, met), means(truth, met), met.sum(axis=(1, 2))
     of_means = np.average(np.abs(a - b).mean(axis=(1, 2, 3)), weights=counts)
-    return tuple(float(x) for x in (np.abs(found - truth)[met].mean(), of_means, np.abs((found - a) - (truth - b))[met].mean()))
+    within = np.abs((predicted - a) - (truth - b))[met].mean()
+    return tuple(float(x) for x in (np.abs(predicted - truth)[met].mean(), of_means, within))
 
 
 def draw_textures(scene: SceneRecord, seen: np.ndarray, faces: np.ndarray, textures: np.ndarray) -> np.ndarray:

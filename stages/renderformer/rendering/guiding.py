@@ -129,13 +129,13 @@ class Guide(Unguided):
         return dr.select(taken, si.to_local(self._draw(dr.select(taken, spot.cell, 0), u.y, v)), wo)
 
     def _draw(self, cell: mi.UInt32, pick: mi.Float, v: mi.Point2f) -> mi.Vector3f:
-        found, step = mi.UInt32(0), BINS // 2
+        bin_index, step = mi.UInt32(0), BINS // 2
         while step:  # binary search
-            below = dr.gather(mi.Float, self.cumulative, cell * BINS + found + (step - 1)) <= pick
-            found = dr.select(below, found + step, found)
+            below = dr.gather(mi.Float, self.cumulative, cell * BINS + bin_index + (step - 1)) <= pick
+            bin_index = dr.select(below, bin_index + step, bin_index)
             step //= 2
-        z = (mi.Float(found // TURNS) + v.x) * (2 / HEIGHTS) - 1
-        sine, cosine = dr.sincos((mi.Float(found % TURNS) + v.y) * (2 * np.pi / TURNS) - np.pi)
+        z = (mi.Float(bin_index // TURNS) + v.x) * (2 / HEIGHTS) - 1
+        sine, cosine = dr.sincos((mi.Float(bin_index % TURNS) + v.y) * (2 * np.pi / TURNS) - np.pi)
         radius = dr.safe_sqrt(1 - z * z)
         return mi.Vector3f(radius * cosine, radius * sine, z)
 

@@ -159,16 +159,16 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
 
         # without dPdUV: a frame that textures do not turn, so that the same samples go the same ways
         si = scene.ray_intersect(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, False)
-        found = si.is_valid()
-        slot = dr.select(found, dr.gather(mi.Int32, lights.slot, si.prim_index, found), -1)
+        valid = si.is_valid()
+        slot = dr.select(valid, dr.gather(mi.Int32, lights.slot, si.prim_index, valid), -1)
         on_light = slot >= 0
         through = on_light & (bounce == 0) & hide  # a camera ray goes on behind a hidden light
 
         # First hit. The shading normal is turned to the viewer, as the two-sided material does.
-        first = found & (bounce == 0) & ~through
+        first = valid & (bounce == 0) & ~through
         facing = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -1, 1)
         distance = dr.norm(si.p - origin)
-        lobes = material.at(si, found)
+        lobes = material.at(si, valid)
         normals += dr.select(first, si.sh_frame.n * facing, 0)
         albedos += dr.select(first, lobes.diffuse + lobes.specular, 0)
         distances += dr.select(first, distance, 0)
@@ -188,7 +188,7 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         guide.add(trail, value, hit & trail.further)
 
         # Next-event estimation at surfaces; lights reflect nothing.
-        surface = found & ~on_light & (bounce < max_bounces) & (diffuse <= max_diffuse) & (glossy <= max_glossy)
+        surface = valid & ~on_light & (bounce < max_bounces) & (diffuse <= max_diffuse) & (glossy <= max_glossy)
         if glossy_filter:
             blurred = 0.5 * dr.sqrt(dr.maximum(1 - widest, 0))
             lobes.alpha = dr.select(widest < 1, dr.maximum(lobes.alpha, blurred), lobes.alpha)

@@ -35,9 +35,9 @@ class ScalarRenderer:
         self.emitters: list[tuple[str, int, np.ndarray, float]] = []
         content = scene.triangles[surfaces].reshape(-1, 3)
         for light in range(scene.n_lights):
-            mine = scene.light_index == light
-            for radiance in np.unique(scene.emission[mine], axis=0):
-                triangles = scene.triangles[mine & (scene.emission == radiance).all(axis=1)]
+            of_light = scene.light_index == light
+            for radiance in np.unique(scene.emission[of_light], axis=0):
+                triangles = scene.triangles[of_light & (scene.emission == radiance).all(axis=1)]
                 for side in (triangles, triangles[:, ::-1]):
                     name = f"light{len(self.emitters)}"
                     mesh, weight = _emitter_mesh(side, radiance, content)
@@ -45,8 +45,10 @@ class ScalarRenderer:
                     self.emitters.append((name, light, radiance, weight))
         self.scene = mi.load_dict({"type": "scene", **shapes})
         self.params = mi.traverse(self.scene)
-        self.shown = np.arange(len(scene.triangles)) if lights_visible else surfaces
-        first = {"surface": surface_mesh(scene, self.shown, albedo_only=True)} if len(self.shown) else {}
+        self.visible_triangles = np.arange(len(scene.triangles)) if lights_visible else surfaces
+        first = (
+            {"surface": surface_mesh(scene, self.visible_triangles, albedo_only=True)} if len(self.visible_triangles) else {}
+        )
         self.first_hit_scene = mi.load_dict({"type": "scene", **first})
 
     def learn(self, views: list[int]) -> None:
@@ -126,10 +128,12 @@ class ScalarRenderer:
         directions = self._directions(view)
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         hits = np.full(directions.shape[:2], -1, np.int32)
-        if len(self.shown):
+        if len(self.visible_triangles):
             for row, column in np.ndindex(hits.shape):
-                found = self.first_hit_scene.ray_intersect_preliminary(mi.Ray3f(origin, mi.Vector3f(directions[row, column])))
-                hits[row, column] = self.shown[found.prim_index] if found.is_valid() else -1
+                intersection = self.first_hit_scene.ray_intersect_preliminary(
+                    mi.Ray3f(origin, mi.Vector3f(directions[row, column]))
+                )
+                hits[row, column] = self.visible_triangles[intersection.prim_index] if intersection.is_valid() else -1
         return hits
 
     def _directions(self, view: int) -> np.ndarray:

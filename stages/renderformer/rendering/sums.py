@@ -41,5 +41,5 @@ class Sums:
 
         depth = np.where(self.hits > 0, self.distance / np.maximum(self.hits, 1e-9), 0).astype(np.float32)
         means = [mean(values) for values in (self.lights, self.direct, self.albedo, self.normal)]
-        found = np.where(self.triangle >= 0, object_index[self.triangle], -1).astype(np.int32)
-        return ViewRecord(*means, depth, mean(self.hits), self.triangle.astype(np.int32), found)
+        object_at_pixel = np.where(self.triangle >= 0, object_index[self.triangle], -1).astype(np.int32)
+        return ViewRecord(*means, depth, mean(self.hits), self.triangle.astype(np.int32), object_at_pixel)

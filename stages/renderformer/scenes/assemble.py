@@ -135,10 +135,10 @@ def assemble(
         for name, array in arrays.items():
             columns[name].append(array)
         described.append({**entry, "faces": faces})
-        mine = patches.get(entry["name"])
-        patch_index.append(np.full(faces, -1) if mine is None else sum(map(len, rows)) + np.arange(faces))
-        if mine is not None:
-            rows.append(mine)
+        object_patches = patches.get(entry["name"])
+        patch_index.append(np.full(faces, -1) if object_patches is None else sum(map(len, rows)) + np.arange(faces))
+        if object_patches is not None:
+            rows.append(object_patches)
 
     solid = [(wall, meshes.wall(wall.name)) for wall in plan.walls]
     solid += [(item, (normalize(v), f)) for item, (v, f) in zip(plan.objects, object_meshes, strict=True)]

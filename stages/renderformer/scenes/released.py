@@ -190,14 +190,14 @@ def files_beside(mesh: Path) -> list[Path]:
     its images, the image of a PLY. Sorted; [] where the mesh cannot be read."""
     from stages.graphics.geometry.load import split_glb
 
-    folder, kind, found = mesh.parent.resolve(), mesh.suffix.lower(), set()
+    folder, kind, side_files = mesh.parent.resolve(), mesh.suffix.lower(), set()
 
     def add(name: str) -> list[Path]:
         """The files that a name can mean: trimesh tries it as written, then relative, then its last part."""
         tries = (name.strip(), name.strip().lstrip("/"), name.strip().rpartition("/")[2])
         files = {(folder / attempt).resolve() for attempt in tries if "\0" not in attempt}
         files = {file for file in files if file.is_relative_to(folder) and file.is_file()}
-        found.update(files)
+        side_files.update(files)
         return sorted(files)
 
     def text(pattern: bytes, data: bytes) -> list[str]:
@@ -219,7 +219,7 @@ def files_beside(mesh: Path) -> list[Path]:
                 add(name)
     except (Reject, OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, struct.error):
         pass  # the scene is rejected when it is read
-    return sorted(found)
+    return sorted(side_files)
 
 
 def _scale(transform: dict[str, Any], where: str) -> np.ndarray:
