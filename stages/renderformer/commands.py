@@ -25,38 +25,32 @@ def command_trace(arguments: argparse.Namespace) -> int:
         denoise=arguments.denoise,
         lights_visible=arguments.lights_visible,
     )
-    view, triangles = arguments.view, arguments.triangles
-    for path in trace(arguments.scene, arguments.out, settings, view, triangles=triangles, room=room(arguments)):
+    for path in trace(arguments.scene, arguments.out, settings, arguments.view, room=room_of(arguments)):
         print(path)
     return 0
 
 
-def room(arguments: argparse.Namespace) -> Any:
+def room_of(arguments: argparse.Namespace) -> Any:
     from stages.renderformer.inference.room import Room
 
-    return Room(arguments.room, arguments.up)
+    return Room(arguments.room, arguments.up, arguments.triangles)
+
+
+def renderer_of(arguments: argparse.Namespace) -> Any:
+    from stages.renderformer.inference.renderer import Renderer
+
+    return Renderer(arguments.checkpoint, arguments.device, arguments.store)
 
 
 def command_predict(arguments: argparse.Namespace) -> int:
+    from stages.renderformer.inference.output import Output
     from stages.renderformer.inference.renderer import predict
+    from stages.renderformer.inference.settings import PredictSettings
 
-    for path in predict(
-        arguments.scene,
-        arguments.checkpoint,
-        Path(arguments.out),
-        resolution=arguments.resolution,
-        view=arguments.view,
-        device=arguments.device,
-        frames=arguments.orbit,
-        arc_deg=arguments.arc,
-        fps=arguments.fps,
-        tonemap=arguments.tonemap,
-        exposure=arguments.exposure,
-        composite_lights=arguments.composite_lights,
-        triangles=arguments.triangles,
-        room=room(arguments),
-        store=arguments.store,
-    ):
+    output = Output(Path(arguments.out), arguments.tonemap, arguments.exposure, arguments.fps)
+    settings = PredictSettings(arguments.view, arguments.orbit, arguments.arc, arguments.resolution, arguments.composite_lights)
+    room = room_of(arguments)  # all that can be refused is refused before the checkpoint is read
+    for path in predict(renderer_of(arguments), arguments.scene, output, settings, room):
         print(path)
     return 0
 
@@ -64,7 +58,8 @@ def command_predict(arguments: argparse.Namespace) -> int:
 def command_compare(arguments: argparse.Namespace) -> int:
     from stages.graphics.metrics import with_lpips
     from stages.renderformer.inference.compare import IMAGES, check_picture, compare_images, compare_scene
-    from stages.renderformer.inference.renderer import write_png
+    from stages.renderformer.inference.output import write_png
+    from stages.renderformer.inference.settings import PredictSettings
 
     first, out = Path(arguments.a), arguments.out
     metrics = with_lpips(arguments.lpips, arguments.lpips_folder)
@@ -77,19 +72,9 @@ def command_compare(arguments: argparse.Namespace) -> int:
             raise UserError("two images are compared as they are: leave --checkpoint out, or give one scene")
         result = compare_images(first, arguments.b, metrics)
     else:
-        result = compare_scene(
-            first,
-            arguments.checkpoint,
-            arguments.resolution,
-            arguments.view,
-            spp=arguments.spp,
-            device=arguments.device,
-            composite_lights=arguments.composite_lights,
-            triangles=arguments.triangles,
-            room=room(arguments),
-            store=arguments.store,
-            metrics=metrics,
-        )
+        settings = PredictSettings(arguments.view, resolution=arguments.resolution, composite_lights=arguments.composite_lights)
+        room = room_of(arguments)
+        result = compare_scene(renderer_of(arguments), first, settings, arguments.spp, room, metrics)
         out = out or f"{first.stem}-compare.png"
     print(json.dumps(result.to_json(), indent=1) if arguments.json else result.table(), flush=True)
     if out is not None:

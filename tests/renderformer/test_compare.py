@@ -144,9 +144,10 @@ def scalar(monkeypatch):
 
 def test_a_scene_is_traced_and_predicted_from_the_same_arrays(cube, checkpoint, scalar):
     from stages.renderformer.inference.renderer import Renderer
+    from stages.renderformer.inference.settings import PredictSettings
     from tests.renderformer.fakes import path_traced
 
-    result = compare_scene(cube, checkpoint, 24, spp=3)
+    result = compare_scene(Renderer(checkpoint), cube, PredictSettings(resolution=24), spp=3)
     renderer = Renderer(checkpoint)
     scene = renderer.load(cube)
     with pytest.warns(UserWarning, match="trained with 16x16"):

@@ -20,10 +20,12 @@ from stages.cli import main
 from stages.graphics.tonemap import TONE_MAPPERS, to_picture
 from stages.renderformer.inference.limits import beyond_limits, light_radiance
 from stages.renderformer.inference.orbit import centre, orbit
+from stages.renderformer.inference.output import Output
 from stages.renderformer.inference.predict import light_passes, predict_frames, predict_scene, single_lights
-from stages.renderformer.inference.renderer import LimitWarning, Renderer
+from stages.renderformer.inference.renderer import LimitWarning, Renderer, predict
 from stages.renderformer.inference.room import Room
 from stages.renderformer.inference.scene_files import load_scene
+from stages.renderformer.inference.settings import PredictSettings
 
 MICRO = dict(
     latent_dim=128, num_layers=1, num_heads=1, dim_feedforward=64, num_register_tokens=2, texture_encode_patch_size=1,
@@ -151,7 +153,7 @@ def test_composited_lights_are_the_sum_of_one_pass_per_light(renderer, cube):
 
 @pytest.mark.parametrize("template", ["floor", "wall", "corner", "box"])
 def test_a_mesh_stands_in_its_room_in_front_of_the_camera(cube, template):
-    scene = load_scene(cube, 4096, Room(template))
+    scene = load_scene(cube, Room(template, triangles=4096))
     corners = object_of(scene)
     floor = scene.triangles[scene.object_index == 0]
     assert corners[..., 2].min() == pytest.approx(floor[..., 2].max(), abs=1e-3)
@@ -165,7 +167,7 @@ def test_a_mesh_stands_in_its_room_in_front_of_the_camera(cube, template):
 def test_the_room_is_lit_and_no_wall_hides_the_object(cube):
     from tests.renderformer.fakes import path_traced
 
-    scene = load_scene(cube, None, Room("corner"))
+    scene = load_scene(cube, Room("corner"))
     (view,) = path_traced(scene, 32, max_spp=12, seed=0, backend={"backend": "scalar"}, denoise=False)
     index = next(i for i, entry in enumerate(scene.meta["objects"]) if entry["kind"] == "object")
     assert (view.object == index).mean() > 0.1
@@ -178,7 +180,7 @@ def test_up_is_y_but_for_stl_and_can_be_chosen(tmp_path):
     heights = {}
     for name, up in (("a.obj", None), ("a.stl", None), ("b.stl", "y"), ("c.obj", "-y"), ("d.obj", "x")):
         tall.export(tmp_path / name)
-        heights[name] = np.ptp(object_of(load_scene(tmp_path / name, 4096, Room(up=up)))[..., 2])
+        heights[name] = np.ptp(object_of(load_scene(tmp_path / name, Room(up=up, triangles=4096)))[..., 2])
     assert [heights[name] > 0.7 for name in ("a.obj", "b.stl", "c.obj")] == [True] * 3
     assert [heights[name] < 0.25 for name in ("a.stl", "d.obj")] == [True] * 2
 
@@ -189,7 +191,7 @@ def test_base_colours_come_along_also_when_decimated(tmp_path):
         part.apply_translation([x, 0, 0])
         part.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(baseColorFactor=colour))
     trimesh.Scene(parts).export(tmp_path / "two.glb")
-    scene = load_scene(tmp_path / "two.glb", 1200)
+    scene = load_scene(tmp_path / "two.glb", Room(triangles=1200))
     assert len(scene.triangles) <= 1200 and "decimated" in scene.meta["notes"][0]
     mine = scene.object_index == 3
     left = scene.triangles[mine].mean(axis=1)[:, 0] < object_of(scene)[..., 0].mean()
@@ -211,17 +213,17 @@ def test_a_mesh_that_remeshing_refuses_is_decimated_as_it_is(tmp_path):
         trimesh.creation.icosphere(subdivisions=2).apply_translation([4 * x, 4 * y, 0]) for x in range(5) for y in range(5)
     ]
     trimesh.util.concatenate(beads).export(tmp_path / "beads.stl")  # more pieces than remesh takes
-    scene = load_scene(tmp_path / "beads.stl", 1600)
+    scene = load_scene(tmp_path / "beads.stl", Room(triangles=1600))
     assert len(scene.triangles) <= 1600 and "scattered" in scene.meta["notes"][0]
 
 
 def test_few_large_triangles_are_subdivided_where_there_is_room(cube):
-    assert len(object_of(load_scene(cube, None))) == 12
-    assert len(object_of(load_scene(cube, 4096))) == 12 * 16
+    assert len(object_of(load_scene(cube))) == 12
+    assert len(object_of(load_scene(cube, Room(triangles=4096)))) == 12 * 16
 
 
 def test_a_small_budget_gets_a_room_with_fewer_walls(cube):
-    templates = [load_scene(cube, triangles).meta["template"] for triangles in (4096, 320, 200)]
+    templates = [load_scene(cube, Room(triangles=triangles)).meta["template"] for triangles in (4096, 320, 200)]
     assert templates == ["corner", "wall", "floor"]
 
 
@@ -247,7 +249,7 @@ def test_an_orbit_is_a_video_that_plays_and_its_frames(checkpoint, cube, tmp_pat
 
 
 def test_an_orbit_goes_around_and_starts_at_the_scenes_own_camera(cube):
-    scene = load_scene(cube, 4096, Room("floor"))
+    scene = load_scene(cube, Room("floor", triangles=4096))
     pivot = centre(scene, 0)
     around = orbit(scene, 4)
     assert around.camera_to_world[0] == pytest.approx(scene.camera_to_world[0], abs=1e-6)
@@ -261,7 +263,7 @@ def test_an_orbit_goes_around_and_starts_at_the_scenes_own_camera(cube):
 
 
 def test_between_walls_an_orbit_swings_and_never_goes_behind_them(cube):
-    scene = load_scene(cube, 4096, Room("corner"))
+    scene = load_scene(cube, Room("corner", triangles=4096))
     swing = orbit(scene, 32)
     assert swing.camera_to_world[0] == pytest.approx(scene.camera_to_world[0], abs=1e-6)
     positions = swing.camera_to_world[:, :3, 3]
@@ -272,11 +274,9 @@ def test_between_walls_an_orbit_swings_and_never_goes_behind_them(cube):
     assert np.ptp(orbit(scene, 32, arc_deg=360).camera_to_world[:, 0, 3]) > np.ptp(positions[:, 0])
 
 
-def test_a_shorter_video_leaves_no_frame_of_a_longer_one(checkpoint, cube, tmp_path):
-    from stages.renderformer.inference.renderer import predict
-
+def test_a_shorter_video_leaves_no_frame_of_a_longer_one(renderer, cube, tmp_path):
     for frames in (3, 2):
-        predict(cube, checkpoint, tmp_path / "a{b}.mp4", 16, device="cpu", frames=frames, room=Room("floor"))
+        predict(renderer, cube, Output(tmp_path / "a{b}.mp4"), PredictSettings(frames=frames, resolution=16), Room("floor"))
     assert [path.name for path in sorted((tmp_path / "a{b}").iterdir())] == ["0000.png", "0001.png"]
 
 
@@ -349,7 +349,7 @@ BEYOND = {
 
 @pytest.mark.parametrize("sentence", BEYOND)
 def test_what_is_beyond_a_limit_is_rendered_with_a_warning_that_names_it(renderer, cube, sentence):
-    scene = load_scene(cube, 1000 if "901" in sentence else 640, Room("floor"))
+    scene = load_scene(cube, Room("floor", triangles=1000 if "901" in sentence else 640))
     if "901" in sentence:
         spare = np.repeat(np.arange(len(scene.triangles)), 900)[: 901 - len(scene.triangles)]
         keep = np.concatenate([np.arange(len(scene.triangles)), spare * 0])
@@ -371,7 +371,7 @@ def test_a_scene_without_light_has_no_lights_to_composite(renderer, cube):
 
 
 def test_composited_lights_have_no_limit_in_number(cube):
-    scene = many_lights(load_scene(cube, 640, Room("floor")), 12)
+    scene = many_lights(load_scene(cube, Room("floor", triangles=640)), 12)
     sentences = [beyond_limits(scene, [0], (16, 16), {}, composite) for composite in (False, True)]
     assert any("12 lights" in s for s in sentences[0]) and not any("12 lights" in s for s in sentences[1])
     # together they emit what the law says, and so does each in its pass

@@ -14,8 +14,10 @@ import pytest
 
 from pipeline.errors import UserError
 from stages.renderformer.dataset import decode_sample
+from stages.renderformer.inference.output import Output
 from stages.renderformer.inference.predict import load_model, predict_scene
-from stages.renderformer.inference.renderer import predict
+from stages.renderformer.inference.renderer import Renderer, predict
+from stages.renderformer.inference.settings import PredictSettings
 from stages.renderformer.s06_train import ModelSection, Train, TrainConfig
 from tests.renderformer.fakes import FakeArtifact, sharded
 
@@ -280,12 +282,13 @@ def test_predict_writes_images(trained, shared_data, tmp_path, capsys):
 
     checkpoint = trained[0].files / "checkpoint"
     scene = next(path for path in sorted((shared_data / "scenes").rglob("*.h5")))
-    (exr,) = predict(scene, checkpoint, tmp_path / "out.exr", resolution=16)
+    renderer = Renderer(checkpoint)
+    (exr,) = predict(renderer, scene, Output(tmp_path / "out.exr"), PredictSettings(resolution=16))
     assert "was trained with at most" in capsys.readouterr().err
     from stages.graphics.exr import read_rgb
 
     assert read_rgb(exr).shape == (16, 16, 3)
-    paths = predict(scene, checkpoint, tmp_path / "all.png", resolution=16, view="all")
+    paths = predict(renderer, scene, Output(tmp_path / "all.png"), PredictSettings("all", resolution=16))
     assert paths[0].name == "all-0.png" and Image.open(paths[0]).size == (16, 16)
 
 
@@ -322,9 +325,11 @@ def test_what_ships_is_small_and_has_its_report():
 )
 def test_predict_refuses(trained, shared_data, tmp_path, arguments, message):
     scene = next(path for path in sorted((shared_data / "scenes").rglob("*.h5")))
-    arguments = {"out": "x.exr", "resolution": 16} | arguments
+    arguments = {"out": "x.exr", "resolution": 16, "device": "auto"} | arguments
     with pytest.raises(UserError, match=message):
-        predict(scene, trained[0].files / "checkpoint", tmp_path / arguments.pop("out"), **arguments)
+        output = Output(tmp_path / arguments.pop("out"))
+        renderer = Renderer(trained[0].files / "checkpoint", arguments.pop("device"))
+        predict(renderer, scene, output, PredictSettings(**arguments))
 
 
 @pytest.fixture

@@ -19,6 +19,8 @@ import numpy as np
 from pipeline.errors import UserError
 from stages.graphics.metrics import METRICS, Metric, flip_map, measure_all
 from stages.graphics.tonemap import exposure_for, exposure_text, from_picture, srgb_encode, to_picture
+from stages.renderformer.inference.renderer import PRETRAINED, Renderer
+from stages.renderformer.inference.settings import PredictSettings
 
 if TYPE_CHECKING:
     from stages.renderformer.inference.room import Room
@@ -126,36 +128,30 @@ def compare_images(a: Path | str, b: Path | str, metrics: Mapping[str, Metric] =
 
 
 def compare_scene(
+    renderer: Renderer,
     path: Path | str,
-    checkpoint: Path | str | None,
-    resolution: int | None = None,
-    view: int = 0,
-    *,
+    settings: PredictSettings,
     spp: int = 256,
-    device: str = "auto",
-    composite_lights: bool = False,
-    triangles: int | None = None,
     room: Room | None = None,
-    store: Path | str = "store",
     metrics: Mapping[str, Metric] = METRICS,
 ) -> Comparison:
     """One camera of a scene or mesh file: path traced with ``spp`` samples and denoised, and predicted."""
     from stages.graphics.mitsuba.backend import choose
-    from stages.renderformer.inference.renderer import Renderer
     from stages.renderformer.rendering.render import render_views
     from stages.renderformer.rendering.settings import RenderSettings
 
     if spp < 1:
         raise UserError(f"{spp} samples per pixel: give at least 1")
-    renderer = Renderer(checkpoint, device, store)
-    scene = renderer.load(path, triangles, room)
+    if not settings.one_image:
+        raise UserError("a comparison is of one camera: give --view N, and no orbit")
+    scene, (view,) = settings.apply(renderer.load(path, room))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        predicted = renderer.render(scene, view, resolution, composite_lights)
+        predicted = renderer.render(scene, view, settings.resolution, settings.composite_lights)
     (traced,) = render_views(scene, RenderSettings(len(predicted), spp), choose("auto"), [view])
     names = (
         f"{path}, view {view}, path traced, {traced.meta['spp']} samples per pixel, denoised",
-        "the model that ships" if checkpoint is None else str(renderer.folder),
+        "the model that ships" if renderer.folder == PRETRAINED else str(renderer.folder),
     )
     notes = [*scene.meta.get("notes", ()), *(str(warning.message) for warning in caught)]
     try:

@@ -1,28 +1,28 @@
 """Inference for users: `Renderer` for programs, ``lightmill predict`` for people.
 
-Reads a scene or mesh file (``stages.renderformer.inference.scene_files``) or a record, and a checkpoint; gives linear HDR
-images, writes EXR, PNG and MP4 files. One design choice: frames are made, checked and written one by one, whether there is
-one or a thousand.
+Reads a scene or mesh file (``stages.renderformer.inference.scene_files``) or a record, and a checkpoint. Gives linear HDR
+images; ``stages.renderformer.inference.output`` writes them. One design choice: frames are rendered, checked and written
+one by one. So an animation of a thousand needs no more memory than a still.
 """
 
 from __future__ import annotations
 
-import itertools
-import re
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.atomic import atomic_path
 from pipeline.errors import UserError
 from stages.renderformer.inference.predict import light_passes, predict_frames
+from stages.renderformer.inference.room import LEAST_TRIANGLES, Room
+from stages.renderformer.inference.settings import PredictSettings
 
 if TYPE_CHECKING:
-    from stages.renderformer.inference.room import Room
+    from stages.renderformer.inference.output import Output
     from stages.renderformer.records import SceneRecord
 
 PRETRAINED = Path(__file__).resolve().parents[3] / "model" / "pretrained"  # the checkpoint that ships, if one does
@@ -90,12 +90,14 @@ class Renderer:
         self.triangles = triangle_limit(self.trained_with)  # of a scene; beyond, expect worse images
         self.resolution = resolution_limit(self.trained_with)  # pixels per side, what is rendered unless told otherwise
 
-    def load(self, path: Path | str, triangles: int | None = None, room: Room | None = None) -> SceneRecord:
-        """A scene file, or a mesh file in its room, decimated to what the network was trained with (or to ``triangles``)."""
-        from stages.renderformer.inference.room import LEAST_TRIANGLES
+    def load(self, path: Path | str, room: Room | None = None) -> SceneRecord:
+        """A scene file, or a mesh file in its room. A room without a limit of triangles gets that of the training data."""
         from stages.renderformer.inference.scene_files import load_scene
 
-        return load_scene(path, triangles or max(self.triangles, LEAST_TRIANGLES), room)
+        room = room or Room()
+        if room.triangles is None:
+            room = replace(room, triangles=max(self.triangles, LEAST_TRIANGLES))
+        return load_scene(path, room)
 
     def render(
         self, scene: SceneRecord | Path | str, view: int = 0, resolution: int | tuple[int, int] | None = None,
@@ -156,128 +158,17 @@ class Renderer:
             yield frame
 
 
-# --- the command --------------------------------------------------------------------------------------------------------------
-
-
 def predict(
-    scene_path: Path | str,
-    checkpoint: Path | str | None,
-    out: Path,
-    resolution: int | tuple[int, int] | None = None,
-    view: int | str = 0,
-    device: str = "auto",
-    *,
-    frames: int | None = None,
-    arc_deg: float | None = None,
-    fps: int = 24,
-    tonemap: str = "none",
-    exposure: float | None = 1.0,
-    composite_lights: bool = False,
-    triangles: int | None = None,
-    room: Room | None = None,
-    store: Path | str = "store",
+    renderer: Renderer, path: Path | str, output: Output, settings: PredictSettings | None = None, room: Room | None = None
 ) -> list[Path]:
-    """Render a scene or mesh file; returns the files written (``OUT-0.exr``, ... where there are several images).
-
-    frames: an orbit of so many around camera ``view`` instead of the view itself (``stages.renderformer.inference.orbit``).
-    The suffix of ``out`` decides: .exr holds linear radiance, .png a picture (`to_picture`), .mp4 a video of all frames
-    beside a folder with their PNGs. exposure: factor of a picture's radiance; None: chosen by the first frame, for all.
-    """
-    from stages.graphics.tonemap import TONE_MAPPERS
-    from stages.renderformer.inference.orbit import orbit
-
-    if out.suffix.lower() not in (".exr", ".png", ".mp4"):
-        raise UserError(f"{out}: the output must end in .exr (linear), .png or .mp4")
-    if not out.parent.is_dir():
-        raise UserError(f"the folder {out.parent} does not exist: make it first")
-    if out.suffix.lower() == ".mp4":
-        earlier_frames(out.with_suffix(""))
-    if tonemap not in TONE_MAPPERS:
-        raise UserError(f"tone mapper {tonemap!r} is unknown: {', '.join(TONE_MAPPERS)}")
-    if fps < 1:
-        raise UserError(f"{fps} frames per second: give at least 1")
-    renderer = Renderer(checkpoint, device, store)
-    scene = renderer.load(scene_path, triangles, room)
-    count = len(scene.fov_deg)
-    if view == "all" and frames is not None:
-        raise UserError("an orbit starts at one camera: give --view N instead of --view all")
-    if view != "all" and not (isinstance(view, int) and 0 <= view < count):
-        raise UserError(f"view {view} of {scene_path} does not exist: it has cameras 0 to {count - 1}, or say all")
-    if frames is not None:
-        scene = orbit(scene, frames, view, arc_deg)
-    views = None if view == "all" or frames is not None else [view]
+    """Render a scene or mesh file (``lightmill predict``); returns the files written. Notes and warnings go to stderr."""
+    settings = settings or PredictSettings()
+    scene, views = settings.apply(renderer.load(path, room))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", LimitWarning)
-        images = renderer.frames(scene, views, resolution, composite_lights)
+        images = renderer.frames(scene, views, settings.resolution, settings.composite_lights)
     for note in scene.meta.get("notes", ()):
         print(f"note: {note}", file=sys.stderr)
     for warning in caught:
         print(f"warning: {warning.message}", file=sys.stderr)
-    return write_frames(out, images, views is None, fps, tonemap, exposure)
-
-
-def write_frames(
-    out: Path, images: Iterable[np.ndarray], several: bool, fps: int = 24, tonemap: str = "none", exposure: float | None = 1.0
-) -> list[Path]:
-    """Write (H, W, 3) linear images as they come, as ``predict`` says; returns the files."""
-    from stages.graphics.exr import write_rgb
-    from stages.graphics.tonemap import exposure_for, to_picture
-    from stages.graphics.video import write_video
-
-    images = iter(images)
-    if exposure is None:
-        first = next(images)
-        exposure, images = exposure_for(first), itertools.chain([first], images)
-    kind, written = out.suffix.lower(), []
-
-    def pictures(place: Callable[[int], Path]) -> Iterator[np.ndarray]:
-        for index, image in enumerate(images):
-            picture = to_picture(image, exposure, tonemap)
-            write_png(place(index), picture)
-            written.append(place(index))
-            yield picture
-
-    if kind == ".mp4":
-        folder = out.with_suffix("")
-        earlier = earlier_frames(folder)
-        folder.mkdir(exist_ok=True)
-        write_video(out, pictures(lambda index: folder / f"{index:04}.png"), fps)
-        for path in set(earlier) - set(written):  # of a longer video of that name
-            path.unlink()
-        return [out, *written]
-
-    def place(index: int) -> Path:
-        return out.with_name(f"{out.stem}-{index}{out.suffix}") if several else out
-
-    if kind == ".png":
-        for _ in pictures(place):
-            pass
-        return written
-    for index, image in enumerate(images):
-        written.append(place(index))
-        write_rgb(written[-1], image)
-    return written
-
-
-def earlier_frames(folder: Path) -> list[Path]:
-    """What a video's folder holds of an earlier one. UserError if it holds anything else."""
-    if not folder.exists():
-        return []
-    if not folder.is_dir():
-        raise UserError(f"{folder} is a file, and the video's frames go into a folder of that name: give another -o")
-    entries = sorted(folder.iterdir())
-    for path in entries:
-        if not re.fullmatch(r"[0-9]{4,}\.png", path.name):
-            raise UserError(f"{folder} is for the video's frames and holds {path.name}: give another -o, or empty it")
-    return entries
-
-
-def write_png(path: Path, picture: np.ndarray) -> None:
-    """(H, W, 3) uint8 as a PNG file, which appears whole or not at all."""
-    from PIL import Image
-
-    try:
-        with atomic_path(path) as temporary:
-            Image.fromarray(picture).save(temporary, format="png")
-    except OSError as error:
-        raise UserError(f"{path} cannot be written ({error}): give a file in an existing folder") from error
+    return output.write(images, settings.one_image)

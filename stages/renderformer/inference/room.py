@@ -48,30 +48,39 @@ LIGHT_RADIANCE, LIGHT_SCALE, LIGHT_DISTANCE = 2500.0, 2.0, 2.6
 
 @dataclass(frozen=True)
 class Room:
-    """What may be chosen. template: floor, wall, corner or box; None: a corner, or with fewer walls where triangles are
-    short. up: which of the file's axes points up, ``x`` to ``-z``; None: z for STL, y for the other formats."""
+    """What may be chosen of the room around a mesh. A value that no room can have is a UserError.
+
+    template: floor, wall, corner or box. None: a corner, or fewer walls if ``triangles`` are too few for a corner.
+    up: the file's axis that points up, ``x`` to ``-z``. None: z for STL, y for the other formats.
+    triangles: most triangles of the scene, room and lights included; a larger mesh is decimated. None: the mesh as it is.
+    """
 
     template: str | None = None
     up: str | None = None
+    triangles: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.template not in (None, *TEMPLATES) or self.up not in (None, *UP):
+            raise UserError(
+                f"room {self.template!r}, up {self.up!r}: expected one of {', '.join(TEMPLATES)}, and one of {', '.join(UP)}"
+            )
+        if self.triangles is not None and self.triangles < LEAST_TRIANGLES:
+            raise UserError(f"a room of {self.triangles} triangles: an object on a floor needs at least {LEAST_TRIANGLES}")
 
 
-def room_scene(path: Path, triangles: int | None = None, room: Room | None = None) -> SceneRecord:
-    """The mesh file in its room, at most ``triangles`` triangles in all (None: the mesh as it is).
+def room_scene(path: Path, room: Room) -> SceneRecord:
+    """The mesh file in its room. ``meta["notes"]`` says what was done to the mesh.
 
-    ``meta["notes"]`` says what was done to the mesh. UserError: the file has no mesh that can be used.
+    UserError: the file has no mesh that can be used, or none that can be decimated so far.
     """
     import trimesh
 
     from stages.graphics.geometry.load import load_mesh, normalise
 
-    room = room or Room()
-    if room.template not in (None, *TEMPLATES) or room.up not in (None, *UP):
-        raise UserError(
-            f"room {room.template!r}, up {room.up!r}: expected one of {', '.join(TEMPLATES)}, and one of {', '.join(UP)}"
-        )
-    if triangles is not None and triangles < LEAST_TRIANGLES:
-        raise UserError(f"a room of {triangles} triangles: an object on a floor needs at least {LEAST_TRIANGLES}")
-    path = path.resolve()  # a link may point anywhere: what the file refers to must lie beside what it points to
+    path, triangles = (
+        path.resolve(),
+        room.triangles,
+    )  # a link may point anywhere: what the file refers to must lie beside what it points to
     try:
         loaded = load_mesh(path, path.parent, MAX_BYTES, MAX_FACES, textures=True)
     except Reject as error:

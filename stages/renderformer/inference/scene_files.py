@@ -17,10 +17,10 @@ SCENES = (".json", ".h5", ".hdf5")
 MESHES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 
 
-def load_scene(path: Path | str, triangles: int | None = None, room: Room | None = None) -> SceneRecord:
-    """The file as a SceneRecord with at least one camera and one light; a UserError says what is wrong with it.
+def load_scene(path: Path | str, room: Room | None = None) -> SceneRecord:
+    """The file as a SceneRecord with at least one camera and one light. A UserError says what is wrong with it.
 
-    triangles: a mesh is decimated so that its scene has at most so many; a scene file is taken as it is. room: of a mesh.
+    ``room`` is what a mesh gets around it, ``Room()`` if None. A scene file is taken as it is.
     """
     from stages.renderformer.inference.room import room_scene
     from stages.renderformer.scenes import released
@@ -34,7 +34,7 @@ def load_scene(path: Path | str, triangles: int | None = None, room: Room | None
     if not path.is_file():
         raise UserError(f"{path} does not exist: give a scene or mesh file")
     if suffix in MESHES:
-        return room_scene(path, triangles, room)
+        return room_scene(path, room or Room())
     scene = released.load_scene(path)
     check_lit(scene, path)
     return scene

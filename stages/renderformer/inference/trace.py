@@ -20,12 +20,11 @@ def trace(
     settings: RenderSettings,
     view: int | Literal["all"] = 0,
     backend: str = "auto",
-    triangles: int | None = None,
     room: Room | None = None,
 ) -> list[Path]:
     """Write the view (or ``OUT-0.exr``, ``OUT-1.exr`` .. for all) as linear RGB and return the files' paths.
 
-    triangles, room: of a mesh, as of ``load_scene``.
+    ``room``: what a mesh gets around it.
     """
     from stages.graphics.exr import write_rgb
     from stages.graphics.mitsuba.backend import choose
@@ -37,7 +36,7 @@ def trace(
         raise UserError(f"{out} is not an EXR file's name: give OUT.exr")
     if not out.parent.is_dir():
         raise UserError(f"the folder {out.parent} does not exist: make it first")
-    scene = load_scene(scene_path, triangles, room)
+    scene = load_scene(scene_path, room)
     count = len(scene.camera_to_world)
     if view != "all" and not 0 <= view < count:
         raise UserError(f"view={view} does not exist: {scene_path} has {count} camera(s), counted from 0; or give 'all'")
