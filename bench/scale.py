@@ -50,7 +50,7 @@ from pipeline.keys import digest_of  # noqa: E402
 from pipeline.plan import item_keys, make_plan, split_config  # noqa: E402
 from pipeline.run import run_pipeline  # noqa: E402
 from pipeline.stage import Item, MapStage, Record, System, load_system  # noqa: E402
-from pipeline.store import Artifact, Store  # noqa: E402
+from pipeline.store import Artifact, Attempt, Store  # noqa: E402
 from pipeline.worker import log_file  # noqa: E402
 
 LEFT = 10  # parts of the second artifact that are not there yet
@@ -106,7 +106,7 @@ def fill(folder: Path, items: int, name: str, left: int) -> None:
     plan = make_plan(run, system, sections, lambda path: "")
     planned = plan[name]
     inputs = planned.inputs({other: store.find(plan[other].place, plan[other].key) for other in plan})
-    draft = store.draft(planned.place, planned.key, planned.preimage, print, {"system": run.system, "config": {}})
+    draft = store.draft(planned.place, planned.key, planned.preimage, Attempt({"system": run.system, "config": {}}))
     draft.set_environment({})
     stage = load_system("bench.scale").stage(name)
     listed = sorted(stage.items(planned.config, inputs), key=lambda item: (item.group, item.id))

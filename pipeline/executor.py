@@ -143,55 +143,72 @@ def run_on(
     log: Callable[[str], None],
 ) -> None:
     """Make all parts by the pool's ``workers``, at most twice as many at a time, and hold each to its task's limits."""
-    flying: dict[Any, PartTask] = {}
-    verdicts: dict[str, Mapping[str, Any]] = {}  # part key -> reject, for the kills that we made ourselves
-    deaths: dict[str, int] = {}  # part key -> workers that died over it
-    openings = 0  # workers that died while they opened
-    exhausted = False
+    _PoolRun(pool, on_result, log).run(waiting, 2 * workers)
 
-    def submit(task: PartTask) -> None:
+
+class _PoolRun:
+    """Parts on their way through one pool: those that workers have, and the deaths of workers so far."""
+
+    def __init__(self, pool: ProcessPool, on_result: Callable[[PartResult], None], log: Callable[[str], None]):
+        self.pool, self.on_result, self.log = pool, on_result, log
+        self.flying: dict[Any, PartTask] = {}  # future -> task
+        self.verdicts: dict[str, Mapping[str, Any]] = {}  # part key -> reject, for the kills that we made ourselves
+        self.deaths: dict[str, int] = {}  # part key -> workers that died over it
+        self.openings = 0  # workers that died while they opened
+
+    def run(self, waiting: Iterator[PartTask], most: int) -> None:
+        """Make all parts that wait, ``most`` at a time."""
+        while True:
+            for task in itertools.islice(waiting, most - len(self.flying)):
+                self._submit(task)
+            if not self.flying:
+                return
+            for future in self._finished():
+                self._collect(future)
+            for task in self.flying.values():
+                _hold_to_limits(task, self.verdicts)
+
+    def _submit(self, task: PartTask) -> None:
         try:
-            flying[pool.schedule(run_part, args=[task])] = task
+            self.flying[self.pool.schedule(run_part, args=[task])] = task
         except RuntimeError:
-            raise PoolBroken([task, *flying.values()]) from None
+            raise PoolBroken([task, *self.flying.values()]) from None
 
-    while True:
-        while not exhausted and len(flying) < 2 * workers:
-            task = next(waiting, None)
-            if task is None:
-                exhausted = True
-            else:
-                submit(task)
-        if not flying:
-            return
-        done, _ = wait(list(flying), timeout=POLL_S, return_when=FIRST_COMPLETED)
-        if not done and not pool.active:  # its threads gave up over a worker killed as it started: nobody will answer
-            raise PoolBroken(flying.values())
-        for future in done:
-            task = flying.pop(future)
-            try:
-                on_result(future.result())
-            except BrokenProcessPool:
-                raise PoolBroken([task, *flying.values()]) from None
-            except ProcessExpired as death:
-                deaths[task.part_key] = deaths.get(task.part_key, 0) + 1
-                state = _read_running(running_file(task.draft, task.part_key))
-                if state is not None and state["item"] is None:
-                    openings += 1
-                    if openings > MAX_OPENINGS:
-                        why = verdicts.get(task.part_key, {}).get("detail", f"exit code {death.exitcode}")
-                        raise MachineError(
-                            f"{task.stage}: workers die while they open what its items need ({why}), before any item: look at "
-                            "the machine's memory and at the logs; finished parts are kept"
-                        ) from None
-                if deaths[task.part_key] > 2 * len(task.items) + MAX_UNEXPLAINED:
-                    raise MachineError(
-                        f"{task.stage}: workers keep dying (exit code {death.exitcode}) and no item is to blame: "
-                        "look at the machine's memory and at the logs; finished parts are kept"
-                    ) from None
-                submit(_after_death(task, death, verdicts.pop(task.part_key, None), log))
-        for task in flying.values():
-            _hold_to_limits(task, verdicts)
+    def _finished(self) -> Iterable[Any]:
+        """The futures that are done, after a moment's wait if there are none."""
+        done, _ = wait(list(self.flying), timeout=POLL_S, return_when=FIRST_COMPLETED)
+        if not done and not self.pool.active:  # its threads gave up over a worker killed as it started: nobody will answer
+            raise PoolBroken(self.flying.values())
+        return done
+
+    def _collect(self, future: Any) -> None:
+        """Hand over the part's result, or submit the part again if its worker died."""
+        task = self.flying.pop(future)
+        try:
+            self.on_result(future.result())
+        except BrokenProcessPool:
+            raise PoolBroken([task, *self.flying.values()]) from None
+        except ProcessExpired as death:
+            self._count(task, death)
+            self._submit(_after_death(task, death, self.verdicts.pop(task.part_key, None), self.log))
+
+    def _count(self, task: PartTask, death: ProcessExpired) -> None:
+        """Count a worker's death. MachineError where there are too many to go on."""
+        self.deaths[task.part_key] = self.deaths.get(task.part_key, 0) + 1
+        state = _read_running(running_file(task.draft, task.part_key))
+        if state is not None and state["item"] is None:
+            self.openings += 1
+            if self.openings > MAX_OPENINGS:
+                why = self.verdicts.get(task.part_key, {}).get("detail", f"exit code {death.exitcode}")
+                raise MachineError(
+                    f"{task.stage}: workers die while they open what its items need ({why}), before any item: look at "
+                    "the machine's memory and at the logs; finished parts are kept"
+                ) from None
+        if self.deaths[task.part_key] > 2 * len(task.items) + MAX_UNEXPLAINED:
+            raise MachineError(
+                f"{task.stage}: workers keep dying (exit code {death.exitcode}) and no item is to blame: "
+                "look at the machine's memory and at the logs; finished parts are kept"
+            ) from None
 
 
 def _after_death(

@@ -24,7 +24,7 @@ from pipeline.plan import Planned, base_key
 from pipeline.progress import duration
 from pipeline.stage import MapStage, RunStage
 from pipeline.status import RunState
-from pipeline.store import DRAFT, SCHEMA, Artifact, Claim, Draft, Store
+from pipeline.store import DRAFT, SCHEMA, Artifact, Attempt, Claim, Draft, Store
 
 
 def machine_rejects(artifact: Artifact | None) -> list[dict[str, Any]]:
@@ -63,7 +63,8 @@ def make_artifact(
         if existing is not None and not (retried and machine_rejects(existing)):
             return existing
         code = code_digest(run.system, name)
-        draft, state = _begin(run, planned, "repair" if adopt is not None else "force" if forced else "make", code)
+        purpose = "repair" if adopt is not None else "force" if forced else "make"
+        draft, state = _begin(run, planned, Attempt(_origin(run, planned), purpose, code))
         started = time.time()
         old_digest = _digest_of(run.store, planned.place, planned.key)
         if adopt is not None:
@@ -102,11 +103,8 @@ def _take(claim: Claim, run: Run, planned: Planned) -> None:
         time.sleep(0.5)
 
 
-def _begin(run: Run, planned: Planned, purpose: str, code: str) -> tuple[Draft, RunState]:
-    """The draft to work in, new or left by an interrupted run, and the state that this run writes into it.
-
-    ``purpose``: make, force or repair. ``code``: the digest of the code at work.
-    """
+def _begin(run: Run, planned: Planned, attempt: Attempt) -> tuple[Draft, RunState]:
+    """The draft to work in, new or left by an interrupted run, and the state that this run writes into it."""
     state: RunState | None = None
 
     def say(text: str) -> None:
@@ -114,7 +112,7 @@ def _begin(run: Run, planned: Planned, purpose: str, code: str) -> tuple[Draft, 
             state.update(line=text)
         run.out(text)
 
-    draft = run.store.draft(planned.place, planned.key, planned.preimage, say, _origin(run, planned), purpose, code)
+    draft = run.store.draft(planned.place, planned.key, planned.preimage, attempt, say)
     draft.sweep()
     state = RunState(draft.path, command=shlex.join(run.command), plan=list(run.stages))
     return draft, state

@@ -13,15 +13,14 @@ run continues.
 
 from pipeline.store.artifact import DRAFT, SCHEMA, Artifact, is_sound, place, read_draft
 from pipeline.store.claim import Claim
-from pipeline.store.draft import FINISHED, UNFINISHED, UNKNOWN, Draft, PartWriter
+from pipeline.store.draft import FINISHED, UNFINISHED, UNKNOWN, Attempt, Draft, PartWriter
 from pipeline.store.folder import Store, history, iter_inputs, store_of
 from pipeline.store.hashes import HashCache
 from pipeline.store.listing import Listing, Row
 from pipeline.store.record import RECORD_ID, Record, record_digest
 
 __all__ = [
-    "DRAFT", "FINISHED", "RECORD_ID",
-    "SCHEMA", "UNFINISHED", "UNKNOWN", "Artifact", "Claim", "Draft", "HashCache", "Listing", "PartWriter", "Record", "Row",
-    "Store", "history", "is_sound",
-    "place", "iter_inputs", "read_draft", "record_digest", "store_of",
+    "DRAFT", "FINISHED", "RECORD_ID", "SCHEMA", "UNFINISHED", "UNKNOWN",
+    "Artifact", "Attempt", "Claim", "Draft", "HashCache", "Listing", "PartWriter", "Record", "Row", "Store",
+    "history", "is_sound", "iter_inputs", "place", "read_draft", "record_digest", "store_of",
 ]  # fmt: skip

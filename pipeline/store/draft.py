@@ -13,6 +13,7 @@ import shutil
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,20 @@ from pipeline.store.record import Record, record_digest
 UNKNOWN = "unknown"  # the digest of code that nobody noted
 FINISHED, UNFINISHED = "markers", "unfinished"  # folders of parts' markers
 WORKING = (FINISHED, UNFINISHED, "running", "state")  # folders of a draft that its artifact does not keep
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What a run notes of itself when it begins a draft or goes on with one.
+
+    origin: what it takes, beside the preimage, to make the artifact anew (system, config).
+    purpose: ``make``, ``force`` or ``repair``. A force takes nothing of what another purpose has finished.
+    code: digest of the code at work.
+    """
+
+    origin: Mapping[str, Any] = field(default_factory=dict)
+    purpose: str = "make"
+    code: str = UNKNOWN
 
 
 class Draft(Records):

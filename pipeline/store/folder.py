@@ -15,7 +15,7 @@ from pipeline.atomic import sync, write_atomic
 from pipeline.errors import Damaged, MachineError, UserError
 from pipeline.store.artifact import DRAFT, Artifact, read_draft
 from pipeline.store.claim import Claim
-from pipeline.store.draft import FINISHED, UNFINISHED, UNKNOWN, WORKING, Draft
+from pipeline.store.draft import FINISHED, UNFINISHED, UNKNOWN, WORKING, Attempt, Draft
 from pipeline.store.files import (
     write_sealed,
 )
@@ -126,30 +126,25 @@ class Store:
         place: str,
         key: str,
         preimage: Mapping[str, Any],
+        attempt: Attempt | None = None,
         out: Any = print,
-        origin: Mapping[str, Any] | None = None,
-        purpose: str = "make",
-        code: str = UNKNOWN,
     ) -> Draft:
-        """A new draft, or the one that an interrupted run left.
-
-        ``origin``: what it takes to make it anew (system, config). ``purpose``: make, force or repair; what force did not begin
-        itself it sets aside. ``code``: the digest of the code at work.
-        """
+        """A new draft, or the one that an interrupted run left. A force sets aside what no force has begun."""
+        attempt = attempt or Attempt()
         path = self.draft_path(place, key)
         before = read_draft(path)
         begun = any(any((path / folder).glob("[!.]*")) for folder in (FINISHED, UNFINISHED, "state"))
-        if begun and purpose == "force" and (before or {}).get("purpose") != "force":
+        if begun and attempt.purpose == "force" and (before or {}).get("purpose") != "force":
             aside = self.trash(path)
             out(f"   note: force takes nothing of what an earlier run had finished; that is in {aside} until gc deletes it")
             before, begun = None, False
         draft = Draft(path, place.rpartition("/")[2], key, preimage, out)
-        about = {"key": key, "preimage": draft.preimage, "started": time.time(), **(origin or {})} if before is None else before
-        others = [other for other in about.get("codes", [UNKNOWN]) if other != code] if begun else []
-        if others and code != UNKNOWN:
+        about = {"key": key, "preimage": draft.preimage, "started": time.time(), **attempt.origin} if before is None else before
+        others = [other for other in about.get("codes", [UNKNOWN]) if other != attempt.code] if begun else []
+        if others and attempt.code != UNKNOWN:
             maker = "code that nobody noted" if others == [UNKNOWN] else "other code of the same version"
             out(f"   note: what is finished of {place} was made by {maker}; it is kept (to begin anew, delete {path})")
-        facts = {"purpose": purpose, "codes": [*others, code]}
+        facts = {"purpose": attempt.purpose, "codes": [*others, attempt.code]}
         if before is None or not facts.items() <= before.items():
             write_sealed(path / DRAFT, {**about, **facts})
         return draft

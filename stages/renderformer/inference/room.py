@@ -77,10 +77,8 @@ def room_scene(path: Path, room: Room) -> SceneRecord:
 
     from stages.graphics.geometry.load import load_mesh, normalise
 
-    path, triangles = (
-        path.resolve(),
-        room.triangles,
-    )  # a link may point anywhere: what the file refers to must lie beside what it points to
+    triangles = room.triangles
+    path = path.resolve()  # a link may point anywhere: what the file refers to must lie beside what it points to
     try:
         loaded = load_mesh(path, path.parent, MAX_BYTES, MAX_FACES, textures=True)
     except Reject as error:
