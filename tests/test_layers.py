@@ -90,12 +90,12 @@ Graph = Mapping[str, set[str]]
 
 def modules(root: Path, packages: Iterable[str]) -> dict[str, Path]:
     """Files by module name; a package's __init__.py has the package's name."""
-    found = {}
+    files = {}
     for package in packages:
         for path in [root / f"{package}.py", *sorted((root / package).rglob("*.py"))]:
             if path.is_file():
-                found[".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")] = path
-    return found
+                files[".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")] = path
+    return files
 
 
 def imports(files: Mapping[str, Path]) -> dict[str, set[str]]:
@@ -103,16 +103,16 @@ def imports(files: Mapping[str, Path]) -> dict[str, set[str]]:
     graph = {}
     for name, path in files.items():
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        found = set()
+        imported = set()
         for node in ast.walk(ast.parse(path.read_bytes())):
             if isinstance(node, ast.Import):
-                found |= {alias.name for alias in node.names}
+                imported |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 base = ".".join([*package.split(".")[: package.count(".") + 2 - node.level], *filter(None, [node.module])])
                 base = base if node.level else node.module
                 for alias in node.names:
-                    found.add(inner if (inner := f"{base}.{alias.name}") in files else base)
-        graph[name] = {other for other in found if other in files and other != name}
+                    imported.add(inner if (inner := f"{base}.{alias.name}") in files else base)
+        graph[name] = {other for other in imported if other in files and other != name}
     return graph
 
 

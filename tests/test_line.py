@@ -111,12 +111,12 @@ def test_the_rows_of_a_table_share_the_data_and_end_in_it(first, folder):
         assert swept.returncode == 0, swept.stdout + swept.stderr
         assert ("running" in swept.stdout) != again
     store = Store(folder / "store")
-    found = json.loads((folder / "table" / "table.json").read_text())
-    made = {row["name"]: store.resolve(row["evaluate"]) for row in found["rows"] if "ours" in row}
-    assert list(made) == ["full", "world_space"] and found["shard"] == store.resolve("shard").key
-    for artifact in made.values():
-        assert artifact.manifest["preimage"]["inputs"]["shard"] == found["shard"]
-    views = json.loads(made["full"].file("metrics.json").read_text())["views"]
+    table = json.loads((folder / "table" / "table.json").read_text())
+    evaluations = {row["name"]: store.resolve(row["evaluate"]) for row in table["rows"] if "ours" in row}
+    assert list(evaluations) == ["full", "world_space"] and table["shard"] == store.resolve("shard").key
+    for artifact in evaluations.values():
+        assert artifact.manifest["preimage"]["inputs"]["shard"] == table["shard"]
+    views = json.loads(evaluations["full"].file("metrics.json").read_text())["views"]
     assert f"{views} views" in (folder / "table" / "table.md").read_text()
 
 

@@ -21,9 +21,9 @@ def test_loss_is_l1_in_log_space():
 
 def test_tone_map_shows_dark_values_and_passes_gradients():
     y = log_radiance(torch.tensor([0.0, 0.1, 1.0, 30.0])).requires_grad_()
-    shown = tone_map(y)
-    torch.testing.assert_close(shown.detach(), torch.tensor([0.0, math.log2(1.1), 1.0, 1.0]))
-    shown.sum().backward()
+    mapped = tone_map(y)
+    torch.testing.assert_close(mapped.detach(), torch.tensor([0.0, math.log2(1.1), 1.0, 1.0]))
+    mapped.sum().backward()
     assert y.grad[1] > 0
 
 
@@ -44,8 +44,8 @@ def test_lpips_equals_its_definition(tmp_path, network, monkeypatch):
     metric = LPIPS.load(None, network)
     rng = np.random.default_rng(3)
     a, b = (rng.uniform(size=(3, 36, 40)) for _ in range(2))
-    found = metric(*(torch.from_numpy(image).float()[None] for image in (a, b))).item()
-    assert found == pytest.approx(distance(tmp_path, network, a, b), rel=1e-4)
+    measured = metric(*(torch.from_numpy(image).float()[None] for image in (a, b))).item()
+    assert measured == pytest.approx(distance(tmp_path, network, a, b), rel=1e-4)
 
 
 def test_the_gradient_goes_through_the_tone_map(tmp_path):

@@ -136,25 +136,25 @@ def test_gradients_reach_the_full_patch_weight_alike():
     patches = material_patches(scene.material, model.config.texture_encode_patch_size)
     everything = torch.arange(len(patches))
     full = Triangles(scene.triangles, scene.vertex_normals, scene.material, scene.segments, patches, everything)
-    found = []
+    gradients = []
     for scenes in (scene, full):
         model.zero_grad()
         model(scenes, cameras, fov, RESOLUTION).sum().backward()
-        found.append(model.texture_encoder.weight.grad.clone())
-    torch.testing.assert_close(*found, atol=1e-3, rtol=1e-4)
+        gradients.append(model.texture_encoder.weight.grad.clone())
+    torch.testing.assert_close(*gradients, atol=1e-3, rtol=1e-4)
 
 
 def test_activation_checkpointing_changes_neither_value_nor_gradient():
     model = build().train()
     scene, cameras, fov = inputs(model, padded=3)
-    found = []
+    results = []
     for on in (False, True):
         model.activation_checkpointing(on)
         model.zero_grad()
         y = model(scene, cameras, fov, RESOLUTION)
         y.square().sum().backward()
-        found.append([y.detach(), *(p.grad.clone() for p in model.parameters())])
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+        results.append([y.detach(), *(p.grad.clone() for p in model.parameters())])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
 def test_compiled_layers_are_compiled_once_for_scenes_of_any_size():

@@ -222,22 +222,22 @@ def test_gradient_leak_revives_negative_pixels_and_changes_no_value():
     model, data = model_of().train(), batch(0)
     with torch.no_grad():
         model.view_transformer.out_dpt.scratch.output_conv2[2].bias.fill_(-0.5)  # all pixels come out negative
-    found = []
+    outputs = []
     for leak in (0.0, 0.1):
         model.view_transformer.gradient_leak = leak
         model.zero_grad()
         y = predict(model, model, data, "cpu", "fp32")
         y.mean().backward()
-        found.append((y.detach(), model.tri_token.grad.abs().sum()))
-    assert (found[0][0] < 0).all() and torch.equal(found[0][0], found[1][0])
-    assert found[1][1] > 50 * found[0][1]
+        outputs.append((y.detach(), model.tri_token.grad.abs().sum()))
+    assert (outputs[0][0] < 0).all() and torch.equal(outputs[0][0], outputs[1][0])
+    assert outputs[1][1] > 50 * outputs[0][1]
 
 
 def test_utilisation_is_never_above_what_there_is():
     """The peak was measured while others computed: what the run itself reached is then the most that is known."""
     work = Work(RenderFormer(ModelConfig(**MICRO)), Group(torch.device("cpu")), "fp32")
-    shown = []
+    utilisations = []
     for ideal_s in (0.5, 1.65, 0.8):  # seconds at the measured peak, of work that took one second
         work.began, work.ideal = time.perf_counter() - 1.0, ideal_s
-        shown.append(work.rates()["mfu"])
-    assert shown == pytest.approx([0.5, 1.0, 0.8 / 1.65], rel=0.01)
+        utilisations.append(work.rates()["mfu"])
+    assert utilisations == pytest.approx([0.5, 1.0, 0.8 / 1.65], rel=0.01)

@@ -26,15 +26,15 @@ NEEDED = {("collect", "folder"): ["collect.path=/tmp"], ("collect", "objaverse")
 
 
 def missing(model: BaseModel, section: dict, path: str) -> list[str]:
-    found = []
+    names = []
     for name in type(model).model_fields:
         if name in ENGINE_FIELDS:
             continue
         if name not in section:
-            found.append(f"{path}.{name}")
+            names.append(f"{path}.{name}")
         elif isinstance(getattr(model, name), BaseModel) and isinstance(section[name], dict):
-            found += missing(getattr(model, name), section[name], f"{path}.{name}")
-    return found
+            names += missing(getattr(model, name), section[name], f"{path}.{name}")
+    return names
 
 
 @pytest.mark.parametrize(("stage", "variant"), VARIANTS)

@@ -65,8 +65,8 @@ def test_a_draft_that_other_code_began_is_continued_and_the_manifest_names_both(
     assert computed == ["n011"]
     (note,) = notes(lines)
     assert "what is finished of toy/numbers was made by other code of the same version; it is kept" in note
-    made = artifacts["numbers"].manifest["code"]
-    assert (made["digest"], made["others"]) == ("b" * 64, ["a" * 64])
+    code_facts = artifacts["numbers"].manifest["code"]
+    assert (code_facts["digest"], code_facts["others"]) == ("b" * 64, ["a" * 64])
     assert any("the code of numbers has changed" in line for line in notes(run()[1]))
     arguments = argparse.Namespace(artifact="numbers", rejects=1)
     assert commands.command_show(Store(tmp_path / "store"), arguments) == 0

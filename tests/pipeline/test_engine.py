@@ -226,15 +226,15 @@ def test_verify_deep_finds_planted_corruption(run):
 @pytest.fixture
 def synced(monkeypatch):
     """Inodes in the order in which they were flushed to the disk."""
-    found: list[int] = []
+    inodes: list[int] = []
     fsync = os.fsync
 
     def noting(handle):
-        found.append(os.fstat(handle).st_ino)
+        inodes.append(os.fstat(handle).st_ino)
         fsync(handle)
 
     monkeypatch.setattr(os, "fsync", noting)
-    return found
+    return inodes
 
 
 def test_files_are_on_the_disk_before_the_manifest_vouches_for_them(run, synced, monkeypatch):
@@ -383,16 +383,16 @@ def test_gc_looks_again_before_each_removal(run, tmp_path):
     artifacts, draft = interrupted(run, store)
     unused(store)
     untouched(draft)
-    found = [path for path, _ in store.garbage(days=14)]
-    assert found[0] == draft and len(found) == 3
+    paths = [path for path, _ in store.garbage(days=14)]
+    assert paths[0] == draft and len(paths) == 3
     with held_elsewhere(store.claim("total", draft.name.removesuffix(".partial"))):
-        assert not any(store.remove(path, days=14) for path in found)
+        assert not any(store.remove(path, days=14) for path in paths)
     run(stage="squares")
     assert store.remove(draft, days=14)
-    assert not any(store.remove(path, days=14) for path in found[1:])
+    assert not any(store.remove(path, days=14) for path in paths[1:])
     assert set(store.folders()) == {artifact.path for artifact in artifacts.values()}
     unused(store)
-    assert all(store.remove(path, days=14) for path in found[1:])
+    assert all(store.remove(path, days=14) for path in paths[1:])
     assert store.folders() == store.drafts() == store.garbage(days=14) == []
 
 
@@ -469,12 +469,12 @@ def test_import_rules():
     for package, names in forbidden.items():
         for path in (ROOT / package).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_bytes())):
-                found = []
+                imported = []
                 if isinstance(node, ast.Import):
-                    found = [alias.name for alias in node.names]
+                    imported = [alias.name for alias in node.names]
                 elif isinstance(node, ast.ImportFrom) and not node.level:
-                    found = [node.module]
-                bad = {name.split(".")[0] for name in found if name != "pipeline.atomic"} & names
+                    imported = [node.module]
+                bad = {name.split(".")[0] for name in imported if name != "pipeline.atomic"} & names
                 assert not bad, f"{path.relative_to(ROOT)}:{node.lineno} imports {bad}"
 
 
@@ -484,8 +484,8 @@ def test_import_rules():
 def test_opening_counts_against_no_item(run):
     """An open of 2 s under a limit of 1 s: before, every process's first item was rejected as `time`."""
     numbers = {"n": 5, "open_s": 2.0, "limits": {"wall_s": 1.0}}
-    made, lines = run(workers=1, stage="numbers", numbers=numbers)
-    assert len(made["numbers"].rows()) == 5 and made["numbers"].rejects() == []
+    artifacts, lines = run(workers=1, stage="numbers", numbers=numbers)
+    assert len(artifacts["numbers"].rows()) == 5 and artifacts["numbers"].rejects() == []
     assert not any("once more" in line for line in lines)
 
 
@@ -527,9 +527,9 @@ def test_a_follower_waits_for_what_the_stage_reads_while_the_leader_works(follow
         for name in ("RANK", "WORLD_SIZE"):
             monkeypatch.delenv(name)
         leader = {**root, "store": str(tmp_path / "other"), "stage": "squares"}
-        made = run_pipeline(leader, ["test"], print)["artifacts"]["squares"]
-        target = Store(tmp_path / "store").root / made.place / made.path.name
+        squares = run_pipeline(leader, ["test"], print)["artifacts"]["squares"]
+        target = Store(tmp_path / "store").root / squares.place / squares.path.name
         target.parent.mkdir(parents=True, exist_ok=True)
-        made.path.rename(target)
+        squares.path.rename(target)
         waiting.result(timeout=30)
     assert followed == [["squares"]]

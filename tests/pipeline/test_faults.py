@@ -81,12 +81,12 @@ def undisturbed(tmp_path_factory):
     """undisturbed(n) -> digests of a run that nothing happened to."""
     folder = tmp_path_factory.mktemp("undisturbed")
 
-    def made(n: int) -> dict[str, str]:
+    def run_digests(n: int) -> dict[str, str]:
         if not (folder / str(n)).exists():
             assert finish(start(command(folder / str(n), workers=0, numbers={"n": n})))[0] == 0
         return digests(folder / str(n))
 
-    return made
+    return run_digests
 
 
 @pytest.mark.slow
@@ -100,8 +100,8 @@ def test_a_campaign_sees_what_differs(tmp_path):
         assert finish(start(command(tmp_path / name, workers=0, numbers={"n": n})))[0] == 0
     stages = ("toy/numbers", "toy/squares", "toy/total")
     assert kills.differences(tmp_path / "calm", tmp_path / "calm", stages) == []
-    found = kills.differences(tmp_path / "calm", tmp_path / "other", stages)
-    assert [line.partition(" ")[0] for line in found] == ["toy/numbers:", "toy/squares:", "toy/total:"]
+    differences = kills.differences(tmp_path / "calm", tmp_path / "other", stages)
+    assert [line.partition(" ")[0] for line in differences] == ["toy/numbers:", "toy/squares:", "toy/total:"]
     path = next((tmp_path / "calm").glob("toy/squares/*/parts/*.tar"))
     path.write_bytes(path.read_bytes()[:-1])
     assert "bytes, not" in kills.differences(tmp_path / "calm", tmp_path / "calm", stages)[0]
@@ -312,7 +312,7 @@ def on_a_small_disk(folder: Path, script: str) -> dict:
 
 def test_a_full_disk_stops_the_run_and_the_next_one_goes_on(tmp_path):
     """60 items of 32 kB do not fit beside the ballast, and do once it is gone."""
-    found = on_a_small_disk(
+    outcome = on_a_small_disk(
         tmp_path,
         """
         (disk / "ballast").write_bytes(bytes(3 << 20))
@@ -331,16 +331,16 @@ def test_a_full_disk_stops_the_run_and_the_next_one_goes_on(tmp_path):
         """,
     )
     for attempt in ("full", "again"):
-        status, output = found[attempt]
+        status, output = outcome[attempt]
         assert status == MachineError.status, output
         assert "No space left on device" in output and "make room" in output and "Traceback" not in output
-    assert found["marked"] > 0 and found["left over"] == []
-    assert found["room"][0] == 0
-    assert found["kept"] >= found["marked"]
+    assert outcome["marked"] > 0 and outcome["left over"] == []
+    assert outcome["room"][0] == 0
+    assert outcome["kept"] >= outcome["marked"]
 
 
 def test_a_read_only_store_can_be_read_and_says_why_it_cannot_be_written(tmp_path):
-    found = on_a_small_disk(
+    outcome = on_a_small_disk(
         tmp_path,
         """
         run(stage="squares")
@@ -354,12 +354,12 @@ def test_a_read_only_store_can_be_read_and_says_why_it_cannot_be_written(tmp_pat
         found["writable"] = run()
         """,
     )
-    assert found["made"][0] == 0 and found["made"][1].count("up to date") == 2
-    status, output = found["to make"]
+    assert outcome["made"][0] == 0 and outcome["made"][1].count("up to date") == 2
+    status, output = outcome["to make"]
     assert status == MachineError.status
     assert "Read-only file system" in output and "Traceback" not in output
-    assert [found[word][0] for word in ("status", "ls", "verify")] == [0, 0, 0], found
-    assert found["writable"][0] == 0
+    assert [outcome[word][0] for word in ("status", "ls", "verify")] == [0, 0, 0], outcome
+    assert outcome["writable"][0] == 0
 
 
 # -- exit codes and logs

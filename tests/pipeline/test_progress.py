@@ -24,7 +24,7 @@ def at_once(monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
 
 
-def shown(stream: io.StringIO) -> str:
+def output_of(stream: io.StringIO) -> str:
     bar = progress.Progress("04 render", 8, reused=2, stream=stream)
     bar.add(2, 1)
     bar.log("a/[b]/" + 100 * "c")
@@ -34,13 +34,13 @@ def shown(stream: io.StringIO) -> str:
 
 
 def test_in_a_pipe_there_are_plain_whole_lines():
-    first, second = shown(io.StringIO()).splitlines()
+    first, second = output_of(io.StringIO()).splitlines()
     assert first.startswith("04 render 4/8, 1 rejected, ") and first.endswith(" left")
     assert second == "a/[b]/" + 100 * "c"
 
 
 def test_on_a_terminal_there_is_a_bar_that_goes_away():
-    text = shown(Screen())
+    text = output_of(Screen())
     assert "04 render 4/8, 1 rejected, " in text and "━" in text and "a/[b]/" + 100 * "c" in text
     assert text.endswith("\x1b[2K") or text.rstrip().endswith("\x1b[?25h\r\x1b[1A\x1b[2K")
 

@@ -95,12 +95,12 @@ def test_repair_ends_with_the_same_digest_and_computes_only_the_damaged_part(run
     path, group = artifact.part_of("n004")
     damage(path if name == "parts" else artifact.path / name)
     lines = mend(tmp_path, artifact)
-    found = computed(tmp_path)
+    computed_items = computed(tmp_path)
     if name == "parts":
-        assert found == [row.item for row in artifact.rows() if row.part == artifact.row("n004").part]
+        assert computed_items == [row.item for row in artifact.rows() if row.part == artifact.row("n004").part]
         assert any("equal to before" in line for line in lines)
     elif name != "items.jsonl":
-        assert found == []
+        assert computed_items == []
     mended = Store(tmp_path / "store").resolve("squares")
     assert mended.digest == artifact.digest and mended.path == artifact.path
     assert mended.verify(deep=True) == []
@@ -227,14 +227,14 @@ def test_verify_and_repair_go_on_after_a_file_that_cannot_be_read(run, tmp_path,
     unreadable(lost, artifact.path / "files" / "card.txt")
     parsed = parser().parse_args(["verify", "--deep", "--store", str(tmp_path / "store")])
     assert parsed.function(parsed) == Damaged.status
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     for problem in (
         f"{lost.name} cannot be read (Input/output error)",
         "card.txt cannot be read",
         f"{flipped.name} does not hash",
     ):
-        assert problem in told
-    assert "1 of 3 artifacts sound" in told
+        assert problem in output
+    assert "1 of 3 artifacts sound" in output
     lines = mend(tmp_path, artifact)
     assert computed(tmp_path) == sorted(row.item for row in artifact.rows() if row.part in (lost.stem, flipped.stem))
     assert any("equal to before" in line for line in lines)
@@ -347,9 +347,9 @@ def test_a_damaged_manifest_stops_only_who_needs_it(run, tmp_path, capsys):
 def parser():
     import argparse
 
-    found = argparse.ArgumentParser()
-    commands.add_commands(found.add_subparsers(), "lightmill")
-    return found
+    root = argparse.ArgumentParser()
+    commands.add_commands(root.add_subparsers(), "lightmill")
+    return root
 
 
 def test_damage_to_an_unfinished_artifact_is_made_good_by_the_next_run(run, tmp_path):

@@ -45,11 +45,11 @@ def test_a_run_can_be_watched_and_its_end_be_read(tmp_path, capsys):
 def test_failures_are_named_with_their_logs_and_rejects_with_their_reasons(tmp_path, capsys):
     status, _ = finish(start(command(tmp_path, workers=2, numbers={"n": 15, "fail": ["n002", "n003"]})))
     assert status == ItemsFailed.status
-    told = ask(capsys, tmp_path)
-    assert f"stopped with status {ItemsFailed.status}" in told
-    assert "rejects   1 unlucky" in told
+    output = ask(capsys, tmp_path)
+    assert f"stopped with status {ItemsFailed.status}" in output
+    assert "rejects   1 unlucky" in output
     for item in ("n002", "n003"):
-        (line,) = [line for line in told.splitlines() if line.strip().startswith(f"failed    {item}: RuntimeError: a bug")]
+        (line,) = [line for line in output.splitlines() if line.strip().startswith(f"failed    {item}: RuntimeError: a bug")]
         log = Path(line.rpartition("(")[2].rstrip(")"))
         assert f"{item}: " in log.read_text() and "Traceback" in log.read_text()
 

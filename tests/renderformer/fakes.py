@@ -148,8 +148,8 @@ def sharded(path: Path, per_shard: int = 4, **inputs: int) -> tuple[dict[str, Fa
     """The inputs of *shard* and its artifact, committed to a store: ``per_shard`` scenes in a tar."""
     from stages.renderformer.s05_shard import Shard, ShardConfig
 
-    made, stage, config = dataset_inputs(path, **inputs), Shard(), ShardConfig()
-    return made, commit_shards(path / "store", made, stage, config, per_shard)
+    fakes, stage, config = dataset_inputs(path, **inputs), Shard(), ShardConfig()
+    return fakes, commit_shards(path / "store", fakes, stage, config, per_shard)
 
 
 def commit_shards(root: Path, inputs: dict, stage, config, per_shard: int) -> Artifact:
@@ -159,13 +159,13 @@ def commit_shards(root: Path, inputs: dict, stage, config, per_shard: int) -> Ar
     items = sorted(stage.items(config, inputs), key=lambda item: (item.group, item.id))
     markers = []
     for group in sorted({item.group for item in items}):
-        mine = [item for item in items if item.group == group]
-        for first in range(0, len(mine), per_shard):
+        group_items = [item for item in items if item.group == group]
+        for first in range(0, len(group_items), per_shard):
             part = draft.open_part()
-            for item in mine[first : first + per_shard]:
+            for item in group_items[first : first + per_shard]:
                 for record in stage.process(worker, item):
                     part.add(record, item.id, group, "")
-            ids = [item.id for item in mine[first : first + per_shard]]
+            ids = [item.id for item in group_items[first : first + per_shard]]
             markers.append({"part_key": str(len(markers)), "group": group, "items": ids, "rejects": [], **part.close()})
     draft.use_parts(markers)
     stage.finish(config, inputs, draft)

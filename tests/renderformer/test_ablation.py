@@ -127,24 +127,24 @@ def test_differences_are_paired_by_view():
     base = {f"s{i}": list(rng.uniform(5, 35, rng.integers(1, 5))) for i in range(40)}
     # listed in another order, as scenes of another run may be
     row = {id: [value - 0.5 for value in values] for id, values in reversed(base.items())}
-    found = difference(result(row), result(base))
-    assert found["psnr"] == pytest.approx({"mean": -0.5, "low": -0.5, "high": -0.5})  # however far views lie apart
-    assert set(found) == {"psnr", "ssim", "flip"}  # LPIPS was not measured
+    differences = difference(result(row), result(base))
+    assert differences["psnr"] == pytest.approx({"mean": -0.5, "low": -0.5, "high": -0.5})  # however far views lie apart
+    assert set(differences) == {"psnr", "ssim", "flip"}  # LPIPS was not measured
 
 
 def test_the_table_says_what_ran_what_did_not_and_what_differs(monkeypatch, tmp_path, capsys):
-    made = {
+    results = {
         "full": result({"a": [20.0, 30.0], "b": [10.0], "c": [20.0]}),
         "no_dpt": result({"a": [19.0, 29.0], "b": [9.0], "c": [19.0]}),
     }
     monkeypatch.setattr(
-        ablation, "load", lambda job, store: made.get(job.plan["train"].config.model.name.replace("base", "full"))
+        ablation, "load", lambda job, store: results.get(job.plan["train"].config.model.name.replace("base", "full"))
     )
     words = [f"store={tmp_path}/store", "train.steps=7"]
     assert write_table("table1_small", None, words, tmp_path / "out") == 1  # rows are missing
     assert "no_self_attention" in capsys.readouterr().out
-    found = json.loads((tmp_path / "out" / "table.json").read_text())
-    rows = {row["name"]: row for row in found["rows"]}
+    table = json.loads((tmp_path / "out" / "table.json").read_text())
+    rows = {row["name"]: row for row in table["rows"]}
     assert rows["no_dpt"]["difference"]["psnr"]["mean"] == pytest.approx(-1)
     assert rows["no_dpt"]["paper_difference"]["psnr"] == pytest.approx(-0.02)
     assert rows["no_dpt"]["training"] == {"loss": 0.25, "largest_grad_norm": 2.0, "steps": 2, "skipped": 0, "seconds": 12.5}

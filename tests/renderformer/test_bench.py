@@ -37,10 +37,10 @@ def test_noise_of_the_truth_is_taken_out_of_an_error(bench, share):
 def test_crossing_is_interpolated_between_doublings(bench):
     points = [bench.Point(16, 1.0, 0.008), bench.Point(32, 3.0, 0.004), bench.Point(64, 4.0, 0.001)]
     assert bench.crossing(points, 0.01) == points[0]
-    found = bench.crossing(points, 0.002)  # half way between 0.004 and 0.001 in logarithms
-    assert found.spp == pytest.approx(32 * 2**0.5, abs=1)
-    assert found.seconds == pytest.approx(12**0.5)
-    assert found.error == 0.002
+    crossing = bench.crossing(points, 0.002)  # half way between 0.004 and 0.001 in logarithms
+    assert crossing.spp == pytest.approx(32 * 2**0.5, abs=1)
+    assert crossing.seconds == pytest.approx(12**0.5)
+    assert crossing.error == 0.002
     assert bench.crossing(points, 0.0005) is None
 
 

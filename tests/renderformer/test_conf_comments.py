@@ -41,10 +41,10 @@ def models(annotation: Any) -> list[type[BaseModel]]:
 
 def fields(annotation: Any, keys: tuple[str, ...]) -> list[Any]:
     """The annotations of the field that the keys lead to, in every variant of a config that has it."""
-    found = [model.model_fields[keys[0]] for model in models(annotation) if keys[0] in model.model_fields]
+    matching = [model.model_fields[keys[0]] for model in models(annotation) if keys[0] in model.model_fields]
     if len(keys) > 1:
-        return [deeper for field in found for deeper in fields(field.annotation, keys[1:])]
-    return [field.annotation for field in found]
+        return [deeper for field in matching for deeper in fields(field.annotation, keys[1:])]
+    return [field.annotation for field in matching]
 
 
 def accepted(annotation: Any, word: str) -> bool:
@@ -67,10 +67,10 @@ CASES = [
 @pytest.mark.parametrize("stage, keys, words", CASES)
 def test_what_a_comment_names_is_accepted(stage, keys, words):
     keys = keys[1:] if keys[0] == stage else keys  # a file of @package _global_
-    found = [field for system in SYSTEMS if stage in system.modules for field in fields(system.stage(stage).Config, keys)]
-    assert found, f"no field {'.'.join(keys)} in the config of {stage}"
+    matching = [field for system in SYSTEMS if stage in system.modules for field in fields(system.stage(stage).Config, keys)]
+    assert matching, f"no field {'.'.join(keys)} in the config of {stage}"
     for word in words:
-        assert any(accepted(field, word) for field in found), f"{'.'.join(keys)}={word} is refused"
+        assert any(accepted(field, word) for field in matching), f"{'.'.join(keys)}={word} is refused"
 
 
 def test_comments_with_alternatives_are_found():

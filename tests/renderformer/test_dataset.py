@@ -159,12 +159,15 @@ def test_textures_travel_with_their_triangles():
     """Rows of patches are per batch; mirroring exchanges corners 1 and 2, along which texels run."""
 
     def example(n: int, textured: int) -> dict:
-        made = {"id": "x", "mask": np.ones(n, bool), "triangles": np.zeros((n, 3, 3)), "vertex_normals": np.zeros((n, 3, 3))}
-        made |= {"camera_to_world": np.eye(4)[None]}
+        arrays = {"id": "x", "mask": np.ones(n, bool), "triangles": np.zeros((n, 3, 3)), "vertex_normals": np.zeros((n, 3, 3))}
+        arrays |= {"camera_to_world": np.eye(4)[None]}
         if textured:
             index = np.where(np.arange(n) < textured, np.arange(n), -1).astype(np.int32)
-            made |= {"patch_index": index, "patches": np.random.default_rng(n).random((textured, 7, 32, 32)).astype(np.float16)}
-        return made
+            arrays |= {
+                "patch_index": index,
+                "patches": np.random.default_rng(n).random((textured, 7, 32, 32)).astype(np.float16),
+            }
+        return arrays
 
     batch = collate([example(3, 2), example(5, 0), example(4, 3)], 3)
     assert batch["patch_index"].tolist() == [[0, 1, -1, -1, -1], [-1] * 5, [2, 3, 4, -1, -1]]

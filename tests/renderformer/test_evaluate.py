@@ -81,11 +81,11 @@ class TestBaselines:
 
     def test_mean_images_are_the_pixelwise_optima(self):
         images = hdr(np.random.default_rng(2), 21, 8, 8, 3)
-        made = mean_images(iter(np.split(images, 7)), limit=100)
-        assert made["linear"] == pytest.approx(clamp(images).mean(axis=0), abs=1e-6)
-        assert made["log"] == pytest.approx(np.median(images, axis=0), abs=5e-3)  # half floats
-        assert mean_psnr(images, made["linear"]) > mean_psnr(images, made["log"])
-        assert log_error(images, made["log"][None]) < log_error(images, made["linear"][None])
+        means = mean_images(iter(np.split(images, 7)), limit=100)
+        assert means["linear"] == pytest.approx(clamp(images).mean(axis=0), abs=1e-6)
+        assert means["log"] == pytest.approx(np.median(images, axis=0), abs=5e-3)  # half floats
+        assert mean_psnr(images, means["linear"]) > mean_psnr(images, means["log"])
+        assert log_error(images, means["log"][None]) < log_error(images, means["linear"][None])
 
     def test_mean_images_read_no_more_than_asked(self):
         images = hdr(np.random.default_rng(3), 12, 8, 8, 3)
@@ -107,9 +107,9 @@ def scores_like(value: float) -> dict[str, float]:
 
 
 def scene(name: str, psnrs: list[float], bar: float, **facts) -> dict:
-    shown = {"roughness": 0.3, "noise": {"log_error": None, "pair": None}}
+    view_facts = {"roughness": 0.3, "noise": {"log_error": None, "pair": None}}
     views = [
-        {"index": i, **shown, "scores": {m: scores_like(value if m == "model" else bar) for m in METHODS}}
+        {"index": i, **view_facts, "scores": {m: scores_like(value if m == "model" else bar) for m in METHODS}}
         for i, value in enumerate(psnrs)
     ]
     return {"id": name, "template": "box", "lights": 1, "triangles": 9, "resolution": 16, "views": views, **facts}
@@ -119,12 +119,12 @@ class TestStatistics:
     def test_bootstrap_resamples_scenes_and_averages_views(self):
         rng = np.random.default_rng(0)
         values = [list(rng.normal(rng.normal(0, 1), 0.1, rng.integers(1, 5))) for _ in range(100)]
-        found = bootstrap(values)
-        assert found["mean"] == pytest.approx(np.mean(np.concatenate(values)))
-        assert found["low"] < found["mean"] < found["high"]
+        estimate = bootstrap(values)
+        assert estimate["mean"] == pytest.approx(np.mean(np.concatenate(values)))
+        assert estimate["low"] < estimate["mean"] < estimate["high"]
         # Scenes of spread 1, a hundred of them: an interval over the views would be narrower.
-        assert 0.3 < found["high"] - found["low"] < 0.6
-        assert bootstrap(values) == found
+        assert 0.3 < estimate["high"] - estimate["low"] < 0.6
+        assert bootstrap(values) == estimate
         assert bootstrap([[3.0, 5.0]]) == {"mean": 4, "low": None, "high": None}
         assert bootstrap([[3.0], [3.1]])["low"] is None and bootstrap([[0.8], [1.0], [0.9]], (0, 1))["high"] == 1
         assert not decided(bootstrap([[3.0, 5.0]])) and decided(bootstrap([[3.0], [3.1], [3.2]]))
@@ -132,8 +132,8 @@ class TestStatistics:
     @pytest.mark.parametrize("count", [3, 4, 8, 23])
     def test_intervals_of_few_scenes_hold_the_truth_as_often_as_they_say(self, count):
         rng = np.random.default_rng(1)
-        found = [bootstrap(rng.normal(size=(count, 1))) for _ in range(300)]
-        assert 0.90 <= np.mean([one["low"] <= 0 <= one["high"] for one in found]) <= 0.98
+        estimates = [bootstrap(rng.normal(size=(count, 1))) for _ in range(300)]
+        assert 0.90 <= np.mean([one["low"] <= 0 <= one["high"] for one in estimates]) <= 0.98
 
     def test_a_model_that_loses_is_told_so(self):
         summary = summarise([scene("a", [10, 12], 11.5), scene("b", [11], 11.5)])
@@ -181,10 +181,10 @@ class TestStatistics:
     def test_a_difference_between_runs_is_paired_and_positive_where_the_first_is_better(self):
         base = [scene(name, [psnr, psnr + 20], 0) for name, psnr in (("a", 10.0), ("b", 30.0), ("c", 50.0))]
         ours = [scene(some["id"], [view["scores"]["model"]["psnr"] + 1 for view in some["views"]], 0) for some in base]
-        found = difference(ours[::-1], base, {"a", "b", "c"})
-        assert (found["scenes"], found["views"]) == (3, 6)
+        differences = difference(ours[::-1], base, {"a", "b", "c"})
+        assert (differences["scenes"], differences["views"]) == (3, 6)
         for name in ("psnr", "flip"):  # a gain in every metric, and the same in every view: no spread is left
-            assert found["gains"][name] == pytest.approx({"mean": 1, "low": 1, "high": 1})
+            assert differences["gains"][name] == pytest.approx({"mean": 1, "low": 1, "high": 1})
         assert difference(ours, base, {"a", "b"})["gains"]["psnr"]["low"] is None
         assert difference(ours, base, set()) is None
 
@@ -211,14 +211,14 @@ class TestCeiling:
             some["views"][0]["noise"]["log_error"] = scored["log_error"]
             scenes.append(some)
             real.append(scored)
-        found = ceiling(scenes, "test", pairs, "all splits")
-        assert found["psnr"]["mean"] == pytest.approx(np.mean([row["psnr"] for row in real]), abs=0.05)
-        assert found["log_error"]["mean"] == pytest.approx(np.mean([row["log_error"] for row in real]))
-        assert (found["psnr"]["of"], found["log_error"]["of"]) == ("all splits", "test")
+        ceilings = ceiling(scenes, "test", pairs, "all splits")
+        assert ceilings["psnr"]["mean"] == pytest.approx(np.mean([row["psnr"] for row in real]), abs=0.05)
+        assert ceilings["log_error"]["mean"] == pytest.approx(np.mean([row["log_error"] for row in real]))
+        assert (ceilings["psnr"]["of"], ceilings["log_error"]["of"]) == ("all splits", "test")
         for some in scenes:  # without estimates the pairs tell the log error as well
             some["views"][0]["noise"]["log_error"] = None
-        found = ceiling(scenes, "test", pairs, "test")
-        assert found["log_error"]["mean"] == pytest.approx(np.mean([row["log_error"] for row in real]), rel=0.02)
+        ceilings = ceiling(scenes, "test", pairs, "test")
+        assert ceilings["log_error"]["mean"] == pytest.approx(np.mean([row["log_error"] for row in real]), rel=0.02)
         assert ceiling(scenes, "test", [], "test") == {}
 
     def test_pairs_are_looked_for_in_all_splits_where_the_evaluated_one_has_few(self, inputs):
@@ -230,11 +230,11 @@ class TestCeiling:
 def test_roughness_of_a_view_is_that_of_what_it_shows(inputs):
     from stages.renderformer.dataset import decode_sample
 
-    shown = decode_sample(inputs["shard"].read("test-0")).scene
-    shown.roughness[:3], shown.specular[:3] = [0.1, 0.5, 0.9], [[0.2] * 3, [0.6] * 3, [0.0] * 3]
-    assert visible_roughness(shown, np.array([[0, 1], [2, -1]])) == pytest.approx((0.2 * 0.1 + 0.6 * 0.5) / 0.8)
-    assert visible_roughness(shown, np.array([[0, 0], [0, 1]])) == pytest.approx((0.6 * 0.1 + 0.6 * 0.5) / 1.2)
-    assert visible_roughness(shown, np.array([[2, -1]])) is None
+    scene = decode_sample(inputs["shard"].read("test-0")).scene
+    scene.roughness[:3], scene.specular[:3] = [0.1, 0.5, 0.9], [[0.2] * 3, [0.6] * 3, [0.0] * 3]
+    assert visible_roughness(scene, np.array([[0, 1], [2, -1]])) == pytest.approx((0.2 * 0.1 + 0.6 * 0.5) / 0.8)
+    assert visible_roughness(scene, np.array([[0, 0], [0, 1]])) == pytest.approx((0.6 * 0.1 + 0.6 * 0.5) / 1.2)
+    assert visible_roughness(scene, np.array([[2, -1]])) is None
 
 
 class Artifact(FakeArtifact):
@@ -262,12 +262,12 @@ def shard_record(name: str, rng: np.random.Generator, cameras: list[int], lights
     light_index = np.where(np.arange(n) < lights, np.arange(n), -1)
     noted = [{"index": i, "error": 0.02, **({"noise": {"sum": PAIR}} if i == 2 else {})} for i in range(4)]
     meta = {"template": "corner", "views": cameras, "render": {"views": noted}}
-    made = SceneRecord(
+    scene = SceneRecord(
         name, triangles, np.ones((n, 3, 3)), np.ones((n, 3)), np.ones((n, 3)), np.ones(n), np.ones((n, 3)),
         light_index, np.zeros(n), np.tile(np.eye(4), (4, 1, 1)), np.full(4, 45.0), meta,
     )  # fmt: skip
     base = np.linspace(0.1, 1.2, SIZE)[:, None, None] * rng.uniform(0.3, 1, 3)
-    members = {"scene.npz": encode_scene(made), "meta.json": pack_json(meta)}
+    members = {"scene.npz": encode_scene(scene), "meta.json": pack_json(meta)}
     for camera in cameras:
         layers = (base + hdr(rng, lights, SIZE, SIZE, 3) * 0.1).astype(np.float32) / lights
         flat = np.zeros((SIZE, SIZE, 3), np.float32)
@@ -307,16 +307,16 @@ def predictor(monkeypatch, inputs):
     """Stands in for the network: ``factor`` times the true image, or a scene's own factor."""
     from stages.renderformer.dataset import decode_sample
 
-    made = SimpleNamespace(factor=0.9, by_scene={})
+    fake = SimpleNamespace(factor=0.9, by_scene={})
 
     def predict_scene(model, scene, views, resolution, device):
         sample = decode_sample(inputs["shard"].read(scene.id))
         assert resolution == SIZE and device == "cpu"
-        return np.stack([sample.views[view].image for view in views]) * made.by_scene.get(scene.id, made.factor)
+        return np.stack([sample.views[view].image for view in views]) * fake.by_scene.get(scene.id, fake.factor)
 
     module = SimpleNamespace(load_model=lambda folder: folder, predict_scene=predict_scene)
     monkeypatch.setitem(sys.modules, "stages.renderformer.inference.predict", module)
-    return made
+    return fake
 
 
 def evaluate(config: EvaluateConfig, inputs, path) -> tuple[list[Record], Artifact]:
@@ -333,12 +333,12 @@ def evaluate(config: EvaluateConfig, inputs, path) -> tuple[list[Record], Artifa
 def test_records_hold_every_score_and_the_predictions(inputs, predictor, tmp_path):
     records, _ = evaluate(EvaluateConfig(), inputs, tmp_path / "out")
     assert [record.id for record in records] == ["test-0", "test-1", "test-2"]
-    made = unpack_json(records[1].members["metrics.json"])
-    assert (made["template"], made["lights"], made["triangles"], made["resolution"]) == ("corner", 2, 6, SIZE)
-    assert [view["noise"] for view in made["views"]] == [{"log_error": 0.02, "pair": pair} for pair in (None, PAIR)]
-    assert {view["roughness"] for view in made["views"]} == {1.0}
-    assert [view["index"] for view in made["views"]] == [0, 2]  # camera indices, not positions
-    for view in made["views"]:
+    metrics = unpack_json(records[1].members["metrics.json"])
+    assert (metrics["template"], metrics["lights"], metrics["triangles"], metrics["resolution"]) == ("corner", 2, 6, SIZE)
+    assert [view["noise"] for view in metrics["views"]] == [{"log_error": 0.02, "pair": pair} for pair in (None, PAIR)]
+    assert {view["roughness"] for view in metrics["views"]} == {1.0}
+    assert [view["index"] for view in metrics["views"]] == [0, 2]  # camera indices, not positions
+    for view in metrics["views"]:
         assert set(view["scores"]) == set(METHODS)
         assert all(set(row) == set(METRICS) for row in view["scores"].values())
     from stages.renderformer.dataset import decode_sample
@@ -346,8 +346,8 @@ def test_records_hold_every_score_and_the_predictions(inputs, predictor, tmp_pat
     truth = decode_sample(inputs["shard"].read("test-1")).views[2]
     prediction = decode_rgb(records[1].members["view2.prediction.exr"])
     assert prediction == pytest.approx(truth.image * 0.9, rel=1e-3)
-    assert made["views"][1]["scores"]["model"] == measure_all(truth.image, truth.image * 0.9)
-    assert made["views"][1]["scores"]["direct"] == measure_all(truth.image, truth.direct)
+    assert metrics["views"][1]["scores"]["model"] == measure_all(truth.image, truth.image * 0.9)
+    assert metrics["views"][1]["scores"]["direct"] == measure_all(truth.image, truth.direct)
     again, _ = evaluate(EvaluateConfig(), inputs, tmp_path / "again")
     assert [record.members for record in again] == [record.members for record in records]
 
@@ -424,9 +424,9 @@ def test_without_training_scenes_the_mean_image_is_that_of_the_others_and_the_re
         "data": {"key": "b", "split": "test"},
         "per_scene": [{"resolution": 16}],
     }
-    for scenes, told in (({"test": 3}, True), ({"train": 6, "test": 3}, False)):
+    for scenes, mentioned in (({"test": 3}, True), ({"train": 6, "test": 3}, False)):
         summary["data"]["scenes"] = scenes
-        assert ("mean training image" in facts(summary, "c")) == told
+        assert ("mean training image" in facts(summary, "c")) == mentioned
 
 
 def test_a_split_without_scenes_is_named(inputs):

@@ -167,10 +167,10 @@ def test_a_given_checkpoint_is_measured_on_imported_scenes(folder, tmp_path, sha
     shutil.rmtree(folder / "validation")
     words = ["stage=evaluate", "scene=imported", f"scene.path={folder}", "render.resolution=64", "render.max_spp=1"]
     words += ["train=given", f"train.checkpoint={shared_data}/parity/no-dpt", "render.backend=scalar", f"store={tmp_path}/s"]
-    made = run_pipeline(compose([*words, "workers=0"]), words, out=lambda line: None)["artifacts"]
-    assert made["train"].path.name.startswith("given-") and len(made["evaluate"].rows()) == 2
+    artifacts = run_pipeline(compose([*words, "workers=0"]), words, out=lambda line: None)["artifacts"]
+    assert artifacts["train"].path.name.startswith("given-") and len(artifacts["evaluate"].rows()) == 2
     given = (shared_data / "parity" / "no-dpt" / "model.safetensors").read_bytes()
-    assert made["train"].file("checkpoint/model.safetensors").read_bytes() == given
+    assert artifacts["train"].file("checkpoint/model.safetensors").read_bytes() == given
     with pytest.raises(UserError, match="holds no config.json"):
         run_pipeline(compose([*words[:-3], f"train.checkpoint={tmp_path}", words[-1]]), words, out=lambda line: None)
 

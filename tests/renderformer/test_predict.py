@@ -193,9 +193,9 @@ def test_base_colours_come_along_also_when_decimated(tmp_path):
     trimesh.Scene(parts).export(tmp_path / "two.glb")
     scene = load_scene(tmp_path / "two.glb", Room(triangles=1200))
     assert len(scene.triangles) <= 1200 and "decimated" in scene.meta["notes"][0]
-    mine = scene.object_index == 3
-    left = scene.triangles[mine].mean(axis=1)[:, 0] < object_of(scene)[..., 0].mean()
-    diffuse = scene.diffuse[mine]
+    of_object = scene.object_index == 3
+    left = scene.triangles[of_object].mean(axis=1)[:, 0] < object_of(scene)[..., 0].mean()
+    diffuse = scene.diffuse[of_object]
     assert (diffuse[left] == diffuse[left][0]).all() and diffuse[left][0, 0] > 0.8 > 0.01 > diffuse[left][0, 2]
     assert diffuse[~left][0, 2] > 0.8 > 0.01 > diffuse[~left][0, 0]
 
@@ -479,29 +479,29 @@ def test_what_cannot_be_asked_for_is_said(checkpoint, cube, tmp_path, capsys, mo
 def wrong_checkpoints(folder: Path, good: Path) -> dict[str, Path]:
     """message -> path."""
     names = ("empty", "cut", "other", "bare", "nan", "unknown")
-    made = {name: folder / name for name in names}
+    folders = {name: folder / name for name in names}
     for name in names[1:]:
-        shutil.copytree(good, made[name])
-    made["empty"].mkdir()
+        shutil.copytree(good, folders[name])
+    folders["empty"].mkdir()
     weights = (good / "model.safetensors").read_bytes()
-    (made["cut"] / "model.safetensors").write_bytes(weights[:1000])
+    (folders["cut"] / "model.safetensors").write_bytes(weights[:1000])
     config = json.loads((good / "config.json").read_text())
-    (made["other"] / "config.json").write_text(json.dumps(config | {"dim_feedforward": 128}))
-    (made["unknown"] / "config.json").write_text(json.dumps(config | {"novel": 1}))
-    (made["bare"] / "model.safetensors").unlink()
+    (folders["other"] / "config.json").write_text(json.dumps(config | {"dim_feedforward": 128}))
+    (folders["unknown"] / "config.json").write_text(json.dumps(config | {"novel": 1}))
+    (folders["bare"] / "model.safetensors").unlink()
     from model.renderformer.network import RenderFormer
 
     model = RenderFormer(ModelConfig(**MICRO))
     model.tri_token.data.fill_(np.nan)
-    files.save(model.config, model.state_dict(), made["nan"])
+    files.save(model.config, model.state_dict(), folders["nan"])
     return {
-        "it has no config.json": made["empty"],
-        "is not a safetensors file": made["cut"],
-        "has shape": made["other"],
-        "unknown field novel": made["unknown"],
-        "model.safetensors is missing": made["bare"],
-        "predicts NaN or infinity": made["nan"],
-        "is a file: a checkpoint is the folder": made["other"] / "config.json",
+        "it has no config.json": folders["empty"],
+        "is not a safetensors file": folders["cut"],
+        "has shape": folders["other"],
+        "unknown field novel": folders["unknown"],
+        "model.safetensors is missing": folders["bare"],
+        "predicts NaN or infinity": folders["nan"],
+        "is a file: a checkpoint is the folder": folders["other"] / "config.json",
         "no-such-folder": folder / "no-such-folder",
     }
 

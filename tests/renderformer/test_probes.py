@@ -202,14 +202,14 @@ class TestBesideTheNetwork:
 
         model = checkpoint.load(inputs["train"].file("checkpoint"))[0]
         scene = edits.one_view(scene, 0)
-        told = []
+        calls = []
         hooks = [
-            layer.multihead_attn.register_forward_hook(lambda cross, given, out: told.append((cross, given, out)))
+            layer.multihead_attn.register_forward_hook(lambda cross, given, out: calls.append((cross, given, out)))
             for layer in model.view_transformer.transformer.layers
         ]
         weights = attention.cross_attention(model, scene, 16)
         assert weights.shape == (2, 4, 2 + len(scene.triangles)) and np.allclose(weights.sum(axis=-1), 1, atol=1e-5)
-        for row, (cross, given, out) in zip(weights, told, strict=True):
+        for row, (cross, given, out) in zip(weights, calls, strict=True):
             mixed = torch.from_numpy(row) @ given[2][0]  # one head: weights times values
             assert torch.allclose(cross.out_proj(merge_heads(mixed[None])), out, atol=1e-5)
         for hook in hooks:
@@ -261,8 +261,8 @@ class TestBesideTheNetwork:
             radiance = np.broadcast_to(level[:, None, None, None], (48, 4, 4, 3)).astype(np.float16)
             samples.append((registers, triangles, {"faces": faces, "radiance": radiance, "met": met}))
         *fit, (registers, triangles, truth) = samples
-        found = decode(fit_decoder(fit, config), registers, triangles, faces, 4)
-        texel, *_ = tokens.errors_of(found, truth["radiance"], met)
+        decoded = decode(fit_decoder(fit, config), registers, triangles, faces, 4)
+        texel, *_ = tokens.errors_of(decoded, truth["radiance"], met)
         assert texel < 0.08  # without the registers 0.3, without the tokens 0.1
 
 
@@ -303,13 +303,14 @@ def test_a_probe_runs_from_config_to_figure(name, inputs, tmp_path):
     from PIL import Image
 
     draft = run(inputs, tmp_path / "probe", name=name, **(TINY | CHEAP[name]))
-    told = json.loads((draft.files / "probe.json").read_text())
-    assert {"name", "title", "question", "setting", "model", "columns", "rows", "notes"} == set(told)
-    assert told["name"] == name and told["rows"] and all(len(row) == len(told["columns"]) for row in told["rows"])
-    assert told["model"]["width"] == 128 and told["model"]["trained_with"]["triangles"] == "768"
+    probe_json = json.loads((draft.files / "probe.json").read_text())
+    assert {"name", "title", "question", "setting", "model", "columns", "rows", "notes"} == set(probe_json)
+    assert probe_json["name"] == name and probe_json["rows"]
+    assert all(len(row) == len(probe_json["columns"]) for row in probe_json["rows"])
+    assert probe_json["model"]["width"] == 128 and probe_json["model"]["trained_with"]["triangles"] == "768"
     assert min(Image.open(draft.files / "figure.png").size) > 200
     table = (draft.files / "table.md").read_text()
-    assert all(note in table for note in told["notes"]) and table.count("\n| ") == len(told["rows"]) + 2
+    assert all(note in table for note in probe_json["notes"]) and table.count("\n| ") == len(probe_json["rows"]) + 2
 
 
 def test_the_table_says_what_the_records_say(inputs, tmp_path):
@@ -319,9 +320,9 @@ def test_the_table_says_what_the_records_say(inputs, tmp_path):
     rows = json.loads((draft.files / "probe.json").read_text())["rows"]
     records = [unpack_json(draft.read(id).members["metrics.json"]) for id in draft.ids()]
     for value, row in zip((48, 768), rows, strict=True):
-        mine = [record for record in records if record["value"] == value]
-        assert row[0] == f"{value}" and float(row[1].replace(",", "")) == round(np.mean([r["triangles"] for r in mine]))
-        assert float(row[2].split()[0]) == pytest.approx(np.mean([r["scores"]["model"]["psnr"] for r in mine]), abs=0.006)
+        at_value = [record for record in records if record["value"] == value]
+        assert row[0] == f"{value}" and float(row[1].replace(",", "")) == round(np.mean([r["triangles"] for r in at_value]))
+        assert float(row[2].split()[0]) == pytest.approx(np.mean([r["scores"]["model"]["psnr"] for r in at_value]), abs=0.006)
     assert float(rows[0][1].replace(",", "")) < float(rows[1][1].replace(",", ""))
 
 

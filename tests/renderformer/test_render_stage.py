@@ -155,8 +155,8 @@ def test_one_process_renders_on_each_gpu(monkeypatch, visible, number):
 def test_summary_tells_samples_errors_and_the_noise_floor(tmp_path, capsys):
     """What ``lightmill show render`` prints, of views whose numbers are given."""
 
-    def view(index, **told):
-        return {"index": index, "status": "ok", "spp": 16, "error": 0.001, "clamped": 0, **told}
+    def view(index, **facts):
+        return {"index": index, "status": "ok", "spp": 16, "error": 0.001, "clamped": 0, **facts}
 
     pair = {"sum": {"log_error": 0.002, "psnr": 40.0}, "reweighted": [{"log_error": e, "psnr": 30.0} for e in (0.001, 0.005)]}
     metas = {
@@ -172,10 +172,10 @@ def test_summary_tells_samples_errors_and_the_noise_floor(tmp_path, capsys):
     records = []
     for id, views in metas.items():
         members = {}
-        for told in views:
-            if told["status"] == "ok":
-                members |= dict(zip(view_members(told["index"]), image.values(), strict=True))
-        views = [{**told, "mean": 0.001} for told in views]
+        for facts in views:
+            if facts["status"] == "ok":
+                members |= dict(zip(view_members(facts["index"]), image.values(), strict=True))
+        views = [{**facts, "mean": 0.001} for facts in views]
         noted = {"template": "wall", "variant": "single", "lights": 1, "views": views}
         records.append(("train", Record(id, {**members, "meta.json": pack_json(noted)})))
     draft = FakeArtifact(tmp_path, records)
@@ -205,7 +205,7 @@ def test_pairs_change_no_image_and_are_the_same_on_every_run(tmp_path):
     without, _ = rendered(tmp_path / "c", [scene], noise_share=0)
     assert first.read("test").members == again.read("test").members
     for index in (0, 1):
-        a, b = (decode_view(made.read("test").members, index) for made in (first, without))
+        a, b = (decode_view(records.read("test").members, index) for records in (first, without))
         assert (a.lights == b.lights).all()
         assert a.meta.pop("noise") and a.meta == b.meta
     Render().finish(config, {}, first)
@@ -250,13 +250,13 @@ def test_noise_floor_is_the_known_noise_of_synthetic_pairs():
         return ViewRecord(lights, blank, blank, blank, blank[..., 0], blank[..., 0], nothing, nothing)
 
     a, b = noisy(), noisy()
-    told = noise.pair_error(a, b, np.random.default_rng(7))
+    errors = noise.pair_error(a, b, np.random.default_rng(7))
     expected_psnr = -10 * np.log10(3 * 0.01**2)  # three layers
-    assert told["sum"]["psnr"] == pytest.approx(expected_psnr, abs=0.1)
-    assert told["sum"]["log_error"] == pytest.approx(log_error(a.image, truth.sum(axis=0)), rel=0.02)
+    assert errors["sum"]["psnr"] == pytest.approx(expected_psnr, abs=0.1)
+    assert errors["sum"]["log_error"] == pytest.approx(log_error(a.image, truth.sum(axis=0)), rel=0.02)
     again = np.random.default_rng(7)
-    assert len(told["reweighted"]) == noise.REWEIGHTINGS == 4
-    for one in told["reweighted"]:
+    assert len(errors["reweighted"]) == noise.REWEIGHTINGS == 4
+    for one in errors["reweighted"]:
         factors = noise.draw_light_factors(noise.LIGHTING, again, 3)
         image, clean = noise.relit(a, factors), np.einsum("lhwc,lc->hwc", truth, factors)
         assert one["log_error"] == pytest.approx(log_error(image, clean), rel=0.03)
@@ -268,10 +268,10 @@ def test_noise_floor_is_the_true_error_of_a_real_scene():
     scene, kept = clutter(cameras=1), {"backend": SCALAR, "denoise": False}
     (truth,) = path_traced(scene, 24, max_spp=4096, seed=9, **kept)
     (a,), (b,) = (path_traced(scene, 24, max_spp=48, seed=seed, **kept) for seed in (0, 1))
-    told = noise.pair_error(a, b, np.random.default_rng(0))
-    assert told["sum"]["log_error"] == pytest.approx(log_error(a.image, truth.image), rel=0.25)
+    errors = noise.pair_error(a, b, np.random.default_rng(0))
+    assert errors["sum"]["log_error"] == pytest.approx(log_error(a.image, truth.image), rel=0.25)
     rng = np.random.default_rng(0)
-    for one in told["reweighted"]:
+    for one in errors["reweighted"]:
         factors = noise.draw_light_factors(noise.LIGHTING, rng, 3)
         true = log_error(noise.relit(a, factors), noise.relit(truth, factors))
         assert one["log_error"] == pytest.approx(true, rel=0.25)
@@ -289,8 +289,8 @@ def made_up(id, *, variant="single", lights=2, side=16, statuses=("ok", "dark", 
         metas.append(meta)
         if status == "ok":
             colour = np.full((side, side, 3), 0.1 * (index + 1), np.float32)
-            found = np.arange(flat.size, dtype=np.int32).reshape(flat.shape) - 1
-            view = ViewRecord(np.stack([colour] * lights), colour, colour, colour, flat, flat, found, found, meta)
+            face_index = np.arange(flat.size, dtype=np.int32).reshape(flat.shape) - 1
+            view = ViewRecord(np.stack([colour] * lights), colour, colour, colour, flat, flat, face_index, face_index, meta)
             members |= encode_view(view)
     noted = {"template": template, "variant": variant, "lights": lights, "views": metas}
     return Record(id, {**members, "meta.json": pack_json(noted)})

@@ -147,7 +147,7 @@ def test_white_furnace(backend, diffuse, specular, roughness):
 
 def cast(triangles, origin, directions):
     """The triangle that each ray hits first, -1 for none (Moeller and Trumbore), the slow obvious way."""
-    found, nearest = np.full(directions.shape[:-1], -1), np.full(directions.shape[:-1], np.inf)
+    nearest_index, nearest = np.full(directions.shape[:-1], -1), np.full(directions.shape[:-1], np.inf)
     for index, (a, b, c) in enumerate(triangles.astype(np.float64)):
         p = np.cross(directions, c - a)
         determinant = p @ (b - a)
@@ -157,8 +157,8 @@ def cast(triangles, origin, directions):
         v = directions @ q / safe
         t = (c - a) @ q / safe
         hit = (abs(determinant) >= 1e-12) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < nearest)
-        found, nearest = np.where(hit, index, found), np.where(hit, t, nearest)
-    return found
+        nearest_index, nearest = np.where(hit, index, nearest_index), np.where(hit, t, nearest)
+    return nearest_index
 
 
 def test_coverage_and_triangles_are_a_ray_cast(backend):
@@ -169,14 +169,14 @@ def test_coverage_and_triangles_are_a_ray_cast(backend):
     x, y = np.meshgrid((2 * np.arange(size) + 1) / size - 1, 1 - (2 * np.arange(size) + 1) / size)
     local = np.stack([x * half, y * half, -np.ones_like(x)], axis=-1)
     pose = scene.camera_to_world[1].astype(np.float64)
-    found = cast(scene.triangles[scene.light_index < 0], pose[:3, 3], local @ pose[:3, :3].T)
-    hit = found >= 0
+    expected = cast(scene.triangles[scene.light_index < 0], pose[:3, 3], local @ pose[:3, :3].T)
+    hit = expected >= 0
     sure = (view.coverage == 0) | (view.coverage == 1)
     assert sure.mean() > 0.7
     assert np.array_equal(view.coverage[sure] == 1, hit[sure])
     assert ((view.depth > 0) == (view.coverage > 0)).all()
-    assert np.array_equal(view.triangle[view.coverage == 0], found[view.coverage == 0])
-    assert np.mean(view.triangle == found) > 0.9  # a sample somewhere in the pixel, and the pixel's centre
+    assert np.array_equal(view.triangle[view.coverage == 0], expected[view.coverage == 0])
+    assert np.mean(view.triangle == expected) > 0.9  # a sample somewhere in the pixel, and the pixel's centre
     assert np.array_equal(view.object, np.where(view.triangle >= 0, view.triangle // 2, -1))
     lit = view.image[view.coverage == 0].any(axis=-1).sum()
     assert lit <= (3 if backend == SCALAR else 0)  # the scalar renderer's first hits are other samples than its light
@@ -189,15 +189,15 @@ def test_lights_are_hidden_from_cameras_but_not_from_reflections(backend):
     back = quad((0, 1, 0.3), (1, 0, 0), (0, 0, 0.9))
     scene = build([(mirror, 0, 0.9, 0.01), (back, 0.001, 0, 1)], [(light, 10)], [camera((0, -2, 0.5))], fov=45)
     kept = {"max_spp": 32, "seed": 0, "backend": backend, "denoise": False}
-    shown, hidden = (path_traced(scene, 24, lights_visible=flag, **kept)[0] for flag in (True, False))
-    bright = np.abs(shown.image.mean(axis=-1) - 10) < 1e-3  # wholly on the light
+    visible, hidden = (path_traced(scene, 24, lights_visible=flag, **kept)[0] for flag in (True, False))
+    bright = np.abs(visible.image.mean(axis=-1) - 10) < 1e-3  # wholly on the light
     bright[12:] = False  # not on its reflection
     assert bright.sum() > 8
     assert hidden.image[bright].max() < 1 and hidden.coverage[bright].min() == 1
-    assert np.allclose(hidden.depth[bright] - shown.depth[bright], 0.5, atol=0.1)
+    assert np.allclose(hidden.depth[bright] - visible.depth[bright], 0.5, atol=0.1)
     lower = np.arange(24) > 13
     assert hidden.image[lower].max() > 8.5
-    assert np.allclose(hidden.image[lower].mean(), shown.image[lower].mean(), rtol=0.03)
+    assert np.allclose(hidden.image[lower].mean(), visible.image[lower].mean(), rtol=0.03)
 
 
 # --- against itself ---------------------------------------------------------------------------------------------------

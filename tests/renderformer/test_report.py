@@ -31,8 +31,8 @@ def commit(store: Store, stage: str, fill, params: dict, inputs: dict, version: 
     draft.use_parts([{"part_key": "0", "group": "", "items": items, "rejects": [], **part.close()}])
     if stage == "evaluate":
         config = EvaluateConfig(timing_scenes=0)
-        found = {name: store.find(name, key) for name, key in inputs.items()}
-        Evaluate().finish(config, found, draft)
+        artifacts = {name: store.find(name, key) for name, key in inputs.items()}
+        Evaluate().finish(config, artifacts, draft)
         Evaluate().check(draft)
     manifest = {"key": draft.key, "preimage": preimage, "outputs": draft.outputs(), "summary": {}, "finished": 0.0}
     return store.commit(draft, params.get("name", "x"), manifest)
@@ -56,18 +56,18 @@ def trained(store: Store, name: str, shard: Artifact) -> Artifact:
 @pytest.fixture
 def factor(monkeypatch):
     """Stands in for the network, which renders the true image times a factor."""
-    made = SimpleNamespace(value=1.0, shard=None)
+    fake = SimpleNamespace(value=1.0, shard=None)
 
     def predict_scene(model, scene, views, resolution, device):
         from stages.renderformer.dataset import decode_sample
 
-        sample = decode_sample(made.shard.read(scene.id))
-        return np.stack([sample.views[view].image for view in views]) * made.value
+        sample = decode_sample(fake.shard.read(scene.id))
+        return np.stack([sample.views[view].image for view in views]) * fake.value
 
     monkeypatch.setitem(
         sys.modules, "stages.renderformer.inference.predict", SimpleNamespace(load_model=str, predict_scene=predict_scene)
     )
-    return made
+    return fake
 
 
 def evaluated(store: Store, name: str, shard: Artifact, factor, value: float, version: int = Evaluate.version) -> Artifact:

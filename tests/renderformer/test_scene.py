@@ -73,9 +73,9 @@ def test_kinds_of_scene(plans):
 
 
 def test_objects(plans):
-    scales = {"single": (1.2, 2.2), "multi": (0.8, 1.8), "thin": (1.4, 1.6), "special": (1.6, 2.1)}
+    ranges = {"single": (1.2, 2.2), "multi": (0.8, 1.8), "thin": (1.4, 1.6), "special": (1.6, 2.1)}
     numbers = {"single": {1}, "thin": {1}, "special": {1}, "empty": {0}}
-    found: dict = {}
+    scales: dict = {}
     for plan in plans["released"]:
         box = plan.template == "box"
         assert len(plan.objects) in numbers.get(plan.variant, {1, 2} if box else {2, 3})
@@ -83,9 +83,9 @@ def test_objects(plans):
         assert len(set(indices)) == len(indices)
         for item in plan.objects:
             assert item.scale[0] == item.scale[1] == item.scale[2] and bool(item.shape) == (plan.variant == "special")
-            found.setdefault((plan.variant, box and plan.variant == "single"), []).append(item.scale[0])
-    for (variant, box), values in found.items():
-        uniform(values, *((1.8, 2.0) if box else scales[variant]))
+            scales.setdefault((plan.variant, box and plan.variant == "single"), []).append(item.scale[0])
+    for (variant, box), values in scales.items():
+        uniform(values, *((1.8, 2.0) if box else ranges[variant]))
     objects = [item for plan in plans["released"] for item in plan.objects]
     uniform([item.translation for item in objects], -1, 1)
     uniform([item.rotation_deg for item in objects], -180, 180)
@@ -94,34 +94,34 @@ def test_objects(plans):
 
 
 def test_walls(plans):
-    found: dict = {}
+    drawn: dict = {}
     for plan in plans["released"]:
         assert tuple(wall.name for wall in plan.walls) == TEMPLATES[plan.template]
         for wall in plan.walls:
             axis, template = WALLS[wall.name], plan.template
-            found.setdefault("spin", []).append(wall.rotation_deg[axis])
+            drawn.setdefault("spin", []).append(wall.rotation_deg[axis])
             tilts = [angle for i, angle in enumerate(wall.rotation_deg) if i != axis]
             if plan.patch:
                 assert tilts == [0, 0] and wall.scale == [1, 1, 1] and wall.translation == [0, 0, 0]
                 continue
             place_of = "box" if template == "box" else "open"
-            found.setdefault(("tilt", place_of), []).append(tilts)
-            found.setdefault(("scale", place_of), []).append(wall.scale)
+            drawn.setdefault(("tilt", place_of), []).append(tilts)
+            drawn.setdefault(("scale", place_of), []).append(wall.scale)
             for i, offset in enumerate(wall.translation):
                 if wall.name == "floor" and i == 2 and template != "box":
-                    found.setdefault("height", []).append(offset)
+                    drawn.setdefault("height", []).append(offset)
                 elif wall.name != "floor" and (template == "wall" and i == 1 or template == "corner" and i == axis):
-                    found.setdefault("along", []).append(offset)
+                    drawn.setdefault("along", []).append(offset)
                 else:
-                    found.setdefault("offset", []).append(offset)
-    uniform(found["spin"], -180, 180)
-    uniform(found["tilt", "open"], -10, 10)
-    uniform(found["tilt", "box"], -3, 3)
-    uniform(found["scale", "open"], 0.9, 1.35)
-    uniform(found["scale", "box"], 1.0, 1.35)
-    uniform(found["along"], -0.25, 0.25)
-    uniform(found["offset"], -0.05, 0.05)
-    height = np.array(found["height"])
+                    drawn.setdefault("offset", []).append(offset)
+    uniform(drawn["spin"], -180, 180)
+    uniform(drawn["tilt", "open"], -10, 10)
+    uniform(drawn["tilt", "box"], -3, 3)
+    uniform(drawn["scale", "open"], 0.9, 1.35)
+    uniform(drawn["scale", "box"], 1.0, 1.35)
+    uniform(drawn["along"], -0.25, 0.25)
+    uniform(drawn["offset"], -0.05, 0.05)
+    height = np.array(drawn["height"])
     assert height.min() >= -0.05 and height.max() <= 0.25
     share((height > 0.15).sum(), len(height), 0.5 + 0.5 / 3)
 
@@ -283,15 +283,15 @@ def test_rungs_use_the_budget():
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def sampled(tmp_path_factory):
     inputs = {"decimate": decimated(tmp_path_factory.mktemp("decimate"))}
     stage, config = SampleScene(), config_of("released", count={"train": 60})
     worker = stage.open(config, inputs, {})
     return stage, config, inputs, worker, [next(iter(stage.process(worker, item))) for item in stage.items(config, inputs)]
 
 
-def test_scene_arrays(made):
-    _, config, _, worker, records = made
+def test_scene_arrays(sampled):
+    _, config, _, worker, records = sampled
     for record in records:
         scene = SceneRecord.from_record(record)
         meta, n = scene.meta, len(scene.triangles)
@@ -315,8 +315,8 @@ def test_scene_arrays(made):
             assert any(entry.get("object_id", "").endswith("blob0") for entry in meta["objects"])
 
 
-def test_same_item_same_bytes_and_more_scenes_change_nothing(made):
-    stage, config, inputs, _, records = made
+def test_same_item_same_bytes_and_more_scenes_change_nothing(sampled):
+    stage, config, inputs, _, records = sampled
     more = config_of("released", count={"train": 90})
     worker, by_id = stage.open(more, inputs, {}), {record.id: record for record in records}
     items = [item for item in stage.items(more, inputs)]
@@ -326,8 +326,8 @@ def test_same_item_same_bytes_and_more_scenes_change_nothing(made):
             assert next(iter(stage.process(worker, item))).members == by_id[item.id].members
 
 
-def test_refusals(made, tmp_path):
-    stage, config, inputs, _, _ = made
+def test_refusals(sampled, tmp_path):
+    stage, config, inputs, _, _ = sampled
     few = {"decimate": decimated(tmp_path, per_split=1)}
     with pytest.raises(UserError, match="at least 2"):
         list(stage.items(config, few))
@@ -340,10 +340,10 @@ def test_refusals(made, tmp_path):
         draw_lights(LightLaw(count=(8, 8), separation=1.7), np.random.default_rng(0), "floor")
 
 
-def test_statistics(made, tmp_path):
+def test_statistics(sampled, tmp_path):
     from tests.renderformer.fakes import FakeArtifact
 
-    stage, config, inputs, _, records = made
+    stage, config, inputs, _, records = sampled
     draft = FakeArtifact(tmp_path, [(record.id.split("-")[0], record) for record in records])
     stage.finish(config, inputs, draft)
     assert draft.notes["scenes"]["split"] == {"test": 24, "train": 60, "validation": 16}

@@ -321,8 +321,8 @@ def test_names_in_an_index_cannot_leave_the_folder(dataset, tmp_path, field):
         row[field] = evil if field != "shard" else f"{evil}.tar"
     index.write_text("".join(json.dumps(row) + "\n" for row in rows))
     if field == "split":
-        told = json.loads(shards.read_text())
-        shards.write_text(json.dumps({evil: next(iter(told.values()))}))
+        listed = json.loads(shards.read_text())
+        shards.write_text(json.dumps({evil: next(iter(listed.values()))}))
     with pytest.raises(UserError, match="escaped"):
         list(export(dataset, tmp_path / "a" / "b" / "out"))
     assert not list(tmp_path.rglob("*escaped*"))

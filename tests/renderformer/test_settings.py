@@ -42,20 +42,20 @@ def inherited(name: str, parents: list[Any]) -> dict[str, Any]:
         chosen = [pair for entry in parents if isinstance(entry, dict) for pair in entry.items()]
         words += [f"{key.removeprefix('override /')}={value}" for key, value in chosen]
         return compose(words)
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for parent in parents:
-        found = merge(found, values_of(f"{Path(name).parent.as_posix()}/{parent.removesuffix('@_here_')}"))
-    return found
+        values = merge(values, values_of(f"{Path(name).parent.as_posix()}/{parent.removesuffix('@_here_')}"))
+    return values
 
 
 def repeated(own: dict[str, Any], base: dict[str, Any], path: str = "") -> list[str]:
-    found = []
+    names = []
     for name, value in own.items():
         if name in base and isinstance(value, dict) and isinstance(base[name], dict):
-            found += repeated(value, base[name], f"{path}{name}.")
+            names += repeated(value, base[name], f"{path}{name}.")
         elif name in base and value == base[name]:
-            found.append(f"{path}{name}")
-    return found
+            names.append(f"{path}{name}")
+    return names
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -65,14 +65,14 @@ def test_a_variant_repeats_no_value_that_it_inherits(name):
 
 
 def different(model: BaseModel, section: dict[str, Any], path: str) -> list[str]:
-    found = []
+    names = []
     for name, value in section.items():
         default = getattr(model, name)
         if isinstance(default, BaseModel):
-            found += different(default, value, f"{path}.{name}")
+            names += different(default, value, f"{path}.{name}")
         elif (list(default) if isinstance(default, tuple) else default) != value:
-            found.append(f"{path}.{name}")
-    return found
+            names.append(f"{path}.{name}")
+    return names
 
 
 def config_class(stage: str) -> type[BaseModel]:

@@ -22,7 +22,7 @@ from tests.renderformer.fakes import commit_shards, dataset_inputs, sharded
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def dataset(tmp_path_factory):
     return sharded(tmp_path_factory.mktemp("shard"))
 
 
@@ -30,8 +30,8 @@ def scenes(inputs) -> list[SceneRecord]:
     return [SceneRecord.from_record(inputs["scene"].read(row.id)) for row in inputs["scene"].rows()]
 
 
-def test_sample_holds_images_unchanged_and_both_metas(made):
-    inputs, artifact = made
+def test_sample_holds_images_unchanged_and_both_metas(dataset):
+    inputs, artifact = dataset
     for row in artifact.rows():
         members, scene, render = artifact.read(row.id).members, inputs["scene"].read(row.id), inputs["render"].read(row.id)
         meta = unpack_json(members["meta.json"])
@@ -43,8 +43,8 @@ def test_sample_holds_images_unchanged_and_both_metas(made):
         assert meta["crc32"] == {name: zlib.crc32(data) for name, data in members.items() if name != "meta.json"}
 
 
-def test_items_need_their_two_records(made):
-    inputs, _ = made
+def test_items_need_their_two_records(dataset):
+    inputs, _ = dataset
     items = list(Shard().items(ShardConfig(), inputs))
     assert [item.id for item in items] == [row.id for row in inputs["render"].rows()]
     assert items[0].needs == (("scene", items[0].id), ("render", items[0].id)) and items[0].group == "test"
@@ -63,8 +63,8 @@ def test_shards_come_near_their_size_in_powers_of_two():
 # --- compact arrays ---------------------------------------------------------------------------------------------------
 
 
-def test_arrays_come_back_within_what_is_stated(made):
-    inputs, artifact = made
+def test_arrays_come_back_within_what_is_stated(dataset):
+    inputs, artifact = dataset
     before = after = 0
     for scene in scenes(inputs):
         members = artifact.read(scene.id).members
@@ -89,9 +89,9 @@ def test_arrays_come_back_within_what_is_stated(made):
     assert 0 < after < before / 5
 
 
-def test_corners_that_were_one_stay_one(made):
+def test_corners_that_were_one_stay_one(dataset):
     """Watertight meshes stay watertight: equal corners are equal afterwards, whatever triangle they belong to."""
-    for scene in scenes(made[0])[:3]:
+    for scene in scenes(dataset[0])[:3]:
         back = decode_scene(scene.id, encode_scene(scene), b"{}")
         before = np.unique(scene.triangles.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1)
         after = np.unique(back.triangles.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1)
@@ -112,8 +112,8 @@ def test_large_scenes_and_odd_values_keep_their_precision():
     assert np.array_equal(back.object_index, scene.object_index) and np.array_equal(back.light_index, scene.light_index)
 
 
-def test_same_scene_same_bytes_and_damage_is_an_error(made):
-    scene = scenes(made[0])[0]
+def test_same_scene_same_bytes_and_damage_is_an_error(dataset):
+    scene = scenes(dataset[0])[0]
     data = encode_scene(scene)
     assert data == encode_scene(scene)
     for broken in (b"", b"nonsense", data[: len(data) // 2], data.replace(b"faces.npy", b"fices.npy")):
@@ -123,8 +123,8 @@ def test_same_scene_same_bytes_and_damage_is_an_error(made):
         decode_scene(scene.id, data, b"{")
 
 
-def test_textures_keep_every_texel_and_fit_their_triangles(made):
-    scene, rng = scenes(made[0])[0], np.random.default_rng(0)
+def test_textures_keep_every_texel_and_fit_their_triangles(dataset):
+    scene, rng = scenes(dataset[0])[0], np.random.default_rng(0)
     index = np.full(len(scene.triangles), -1, np.int32)
     index[[3, 9]] = [1, 0]
     patches = rng.uniform(size=(2, 7, 32, 32)).astype(np.float16)
@@ -141,8 +141,8 @@ def test_textures_keep_every_texel_and_fit_their_triangles(made):
 # --- index and card ---------------------------------------------------------------------------------------------------
 
 
-def test_index_leads_to_every_member(made):
-    _, artifact = made
+def test_index_leads_to_every_member(dataset):
+    _, artifact = dataset
     shards = json.loads(artifact.file("shards.json").read_text())
     assert [part["samples"] for part in shards["train"]["parts"]] == [4, 2] and shards["train"]["samples"] == 6
     lines = [json.loads(line) for line in artifact.file("index.jsonl").read_text().splitlines()]
@@ -156,9 +156,9 @@ def test_index_leads_to_every_member(made):
     assert all(part["bytes"] == (artifact.path / part["path"]).stat().st_size for s in shards.values() for part in s["parts"])
 
 
-def test_card_tells_what_is_there_and_its_reader_works(made):
+def test_card_tells_what_is_there_and_its_reader_works(dataset):
     """Ten lines of numpy, copied out of the card, give the arrays that the loader gives."""
-    _, artifact = made
+    _, artifact = dataset
     card, page = artifact.file("README.md").read_text(), artifact.file("card.html").read_text()
     assert "| train | 6 | 18 |" in card and "| CC0 | files |" in card and artifact.key in card
     assert (
@@ -181,8 +181,8 @@ def test_card_tells_what_is_there_and_its_reader_works(made):
             assert np.array_equal(read[name], getattr(scene, name)), name
 
 
-def test_card_documents_every_array(made):
-    _, artifact = made
+def test_card_documents_every_array(dataset):
+    _, artifact = dataset
     card = artifact.file("README.md").read_text()
     named = {word for row in re.findall(r"\| scene.npz \| ([^|]+) \|", card) for word in row.strip().split(", ")}
     members = [artifact.read(id).members["scene.npz"] for id in artifact.ids("train")[:2]]
@@ -204,11 +204,11 @@ def test_object_in_two_splits_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("opener", ["{}", "pipe:cat {}", "file:{}"])
-def test_plain_webdataset_reads_the_shards(made, opener):
+def test_plain_webdataset_reads_the_shards(dataset, opener):
     webdataset = pytest.importorskip("webdataset")
     from stages.renderformer.dataset import decode_members, decode_sample
 
-    _, artifact = made
+    _, artifact = dataset
     parts = json.loads(artifact.file("shards.json").read_text())["train"]["parts"]
     urls = [opener.format(artifact.path / part["path"]) for part in parts]
     samples = list(webdataset.WebDataset(urls, shardshuffle=False))

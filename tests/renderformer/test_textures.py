@@ -343,18 +343,18 @@ def test_textured_scenes_follow_their_law_and_leave_the_rest_alone(tmp_path):
         assert before.patches is None
         untouched = ("triangles", "vertex_normals", "emission", "light_index", "object_index", "camera_to_world", "fov_deg")
         assert all(np.array_equal(getattr(before, name), getattr(scene, name)) for name in untouched)
-        mine = np.zeros(len(scene.triangles), bool) if scene.patch_index is None else scene.patch_index >= 0
+        textured = np.zeros(len(scene.triangles), bool) if scene.patch_index is None else scene.patch_index >= 0
         for number, (old, new) in enumerate(zip(before.meta["objects"], scene.meta["objects"], strict=True)):
             faces = scene.object_index == number
             states[new["kind"], new.get("textured", "texture" in new)] += 1
             if new.get("object_id", "").endswith(BARE):
                 assert new.get("textured") in (None, False)
             if "texture" not in new:
-                assert not mine[faces].any() and old == {k: v for k, v in new.items() if k != "textured"}
+                assert not textured[faces].any() and old == {k: v for k, v in new.items() if k != "textured"}
                 for name in ("diffuse", "specular", "roughness"):
                     assert np.array_equal(getattr(before, name)[faces], getattr(scene, name)[faces])
                 continue
-            assert mine[faces].all()
+            assert textured[faces].all()
             patches = scene.patches[scene.patch_index[faces]].astype(float)
             material = new["material"]
             assert patches[:, :3].max() <= material["bound"] + 1e-3 and patches[:, :3].std() > 0
@@ -365,8 +365,8 @@ def test_textured_scenes_follow_their_law_and_leave_the_rest_alone(tmp_path):
 
     stage, draft = SampleScene(), FakeArtifact(tmp_path / "draft", [("", scene.to_record()) for scene in scenes])
     stage.finish(config, inputs, draft)
-    told = draft.notes["scenes"]["textures"]
-    assert told["object_without_base_colours"] > 0 and told["wall_textured"] == states["wall", True]
+    counts = draft.notes["scenes"]["textures"]
+    assert counts["object_without_base_colours"] > 0 and counts["wall_textured"] == states["wall", True]
     again = sampled(config.model_copy(update={"count": SceneCount(train=3, validation=0, test=0)}), inputs)
     assert [s.to_record().members for s in again] == [s.to_record().members for s in scenes[:3]]
 
