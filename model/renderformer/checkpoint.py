@@ -54,13 +54,13 @@ def _check_shapes(config: ModelConfig, stored: Mapping[str, tuple[int, ...]], pa
     if layers > len(stored):
         raise InputError(f"{path} holds {len(stored)} tensors, {CONFIG} asks for {layers} layers")
     with torch.device("meta"):
-        own = {name: tuple(tensor.shape) for name, tensor in RenderFormer(config).state_dict().items()}
-    for what, which in (("unknown", stored.keys() - own.keys()), ("missing", own.keys() - stored.keys())):
-        if which:
-            raise InputError(f"{path}: {what} parameter {', '.join(sorted(which))} for the network of {CONFIG}")
+        expected = {name: tuple(tensor.shape) for name, tensor in RenderFormer(config).state_dict().items()}
+    for kind, differing in (("unknown", stored.keys() - expected.keys()), ("missing", expected.keys() - stored.keys())):
+        if differing:
+            raise InputError(f"{path}: {kind} parameter {', '.join(sorted(differing))} for the network of {CONFIG}")
     for name, shape in stored.items():
-        if shape != own[name]:
-            raise InputError(f"{path}: {name} has shape {shape}, {CONFIG} asks for {own[name]}")
+        if shape != expected[name]:
+            raise InputError(f"{path}: {name} has shape {shape}, {CONFIG} asks for {expected[name]}")
 
 
 def load(folder: Path) -> tuple[RenderFormer, dict[str, str]]:

@@ -149,8 +149,8 @@ class ModelConfig:
     @classmethod
     def from_dict(cls, data: dict[str, Any], where: str = "config") -> ModelConfig:
         """From a released ``config.json``; every field must be there, and no other."""
-        known = [field.name for field in dataclasses.fields(cls)]
-        unknown, missing = sorted(set(data) - set(known)), sorted(set(known) - set(data))
+        field_names = [field.name for field in dataclasses.fields(cls)]
+        unknown, missing = sorted(set(data) - set(field_names)), sorted(set(field_names) - set(data))
         if unknown:
             raise InputError(f"{where}: unknown field {', '.join(unknown)}: this code would not compute what it means")
         if missing:

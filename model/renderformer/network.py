@@ -294,10 +294,10 @@ class RenderFormer(nn.Module):
         positions, segments, registers = scenes.triangles.flatten(1), scenes.segments, config.num_register_tokens
         if registers:  # in front of the triangles of each scene
             rows, places = [], []
-            for own, where in zip(segments.split(x, 0), segments.split(positions, 0), strict=True):
-                mean = where.unflatten(1, (3, 3)).mean(dim=(0, 1)).repeat(3)
-                rows += [self.reg_tokens[0].to(x.dtype), own]
-                places += [mean.expand(registers, -1), where]
+            for scene_tokens, scene_positions in zip(segments.split(x, 0), segments.split(positions, 0), strict=True):
+                mean = scene_positions.unflatten(1, (3, 3)).mean(dim=(0, 1)).repeat(3)
+                rows += [self.reg_tokens[0].to(x.dtype), scene_tokens]
+                places += [mean.expand(registers, -1), scene_positions]
             x, positions = torch.cat(rows), torch.cat(places)
             segments = Segments([registers + n for n in segments.lengths])
         return Tokens(self.transformer(x, positions, segments), positions, segments)

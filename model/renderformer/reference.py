@@ -88,8 +88,8 @@ def decode(
             if config.view_transformer_use_swin_attn:
                 allowed = _windows(side, 4 if i % 2 else 0, x.device)
             # Swin's self-attention has no rotary encoding.
-            own = None if config.view_transformer_use_swin_attn else rope
-            x = x + _self_attention(layer.self_attn, layer.self_attn_norm(x), own, at, allowed)
+            self_rope = None if config.view_transformer_use_swin_attn else rope
+            x = x + _self_attention(layer.self_attn, layer.self_attn_norm(x), self_rope, at, allowed)
         x = x + layer.ffn(layer.ffn_norm(x))
         outputs.append(x)
     if config.use_dpt_decoder:

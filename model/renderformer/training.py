@@ -157,7 +157,7 @@ class _State:
         self.best: float | None = None  # lowest validation log error so far
 
     def save(self) -> None:
-        whole = {
+        saved = {
             "identity": self._identity(),
             "plain": {name: getattr(self, name) for name in self.PLAIN},
             "model": gather(self.model.state_dict()),
@@ -166,10 +166,10 @@ class _State:
             "rng": {"cpu": torch.get_rng_state()},
         }
         if torch.cuda.is_available():
-            whole["rng"]["cuda"] = torch.cuda.get_rng_state()
+            saved["rng"]["cuda"] = torch.cuda.get_rng_state()
         if self.group.leads:
             with atomic_path(self.path) as temporary:
-                torch.save(whole, temporary)
+                torch.save(saved, temporary)
 
     def load(self) -> bool:
         """Whether there was something to go on from."""
@@ -178,8 +178,8 @@ class _State:
         saved = torch.load(self.path, map_location="cpu", weights_only=True)
         if saved["identity"] != self._identity():
             raise InputError(f"{self.path} belongs to a training run of another configuration: give it another folder")
-        own = self.model.state_dict()
-        self.model.load_state_dict({name: scatter(value, own[name]) for name, value in saved["model"].items()})
+        current = self.model.state_dict()
+        self.model.load_state_dict({name: scatter(value, current[name]) for name, value in saved["model"].items()})
         for optimizer, state in zip(self.optimizers, saved["optimizers"], strict=True):
             parameters = [p for group in optimizer.param_groups for p in group["params"]]
             for index, values in state["state"].items():

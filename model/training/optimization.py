@@ -70,12 +70,12 @@ class Average:
     @contextmanager
     def in_place(self) -> Iterator[None]:
         """The model with the averaged weights, for as long as the context lasts."""
-        own = {name: p.detach().clone() for name, p in self.model.named_parameters()}
+        current = {name: p.detach().clone() for name, p in self.model.named_parameters()}
         self._assign(self.values)
         try:
             yield
         finally:
-            self._assign(own)
+            self._assign(current)
 
     @torch.no_grad()
     def _assign(self, values: dict[str, Tensor]) -> None:

@@ -58,13 +58,13 @@ def join(device: str) -> Iterator[Group]:
     if world == 1:
         yield Group(torch.device(device))
         return
-    own = torch.device(device)
-    if own.type == "cuda":
-        own = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-        torch.cuda.set_device(own)
-    dist.init_process_group("cpu:gloo,cuda:nccl" if own.type == "cuda" else "gloo")
+    own_device = torch.device(device)
+    if own_device.type == "cuda":
+        own_device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        torch.cuda.set_device(own_device)
+    dist.init_process_group("cpu:gloo,cuda:nccl" if own_device.type == "cuda" else "gloo")
     try:
-        yield Group(own, dist.get_rank(), world)
+        yield Group(own_device, dist.get_rank(), world)
     finally:
         dist.destroy_process_group()
 

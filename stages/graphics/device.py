@@ -5,14 +5,14 @@ from __future__ import annotations
 from pipeline.errors import UserError
 
 
-def choose_device(wanted: str, setting: str) -> str:
+def choose_device(choice: str, setting: str) -> str:
     """``wanted`` auto: CUDA where there is one, else the CPU. ``setting`` names where a person changes it, for errors."""
     import torch
 
-    if wanted == "auto":
+    if choice == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
-    if wanted not in ("cpu", "cuda"):
-        raise UserError(f"{setting}={wanted!r} is unknown: auto, cpu or cuda")
-    if wanted == "cuda" and not torch.cuda.is_available():
+    if choice not in ("cpu", "cuda"):
+        raise UserError(f"{setting}={choice!r} is unknown: auto, cpu or cuda")
+    if choice == "cuda" and not torch.cuda.is_available():
         raise UserError(f"{setting}=cuda, but torch sees no GPU: use {setting}=cpu, or install the CUDA build of torch")
-    return wanted
+    return choice

@@ -172,9 +172,9 @@ def named(names: Iterable[str]) -> dict[str, Metric]:
     def absent(reference: np.ndarray, test: np.ndarray) -> float:
         raise AssertionError("with_lpips has the metric with its weights")
 
-    wanted = set(names)
-    known = METRICS | {metric.name: metric for network in LPIPS_NETWORKS for metric in [_lpips(network, absent)]}
-    return {name: metric for name, metric in known.items() if name in wanted}
+    chosen = set(names)
+    by_name = METRICS | {metric.name: metric for network in LPIPS_NETWORKS for metric in [_lpips(network, absent)]}
+    return {name: metric for name, metric in by_name.items() if name in chosen}
 
 
 def check_pair(reference: np.ndarray, test: np.ndarray) -> None:

@@ -101,10 +101,10 @@ class Collect(MapStage):
             from stages.renderformer.objects.procedural import FAMILIES
 
             unknown = sorted({*config.test_families, *config.validation_families} - set(FAMILIES))
-            both = sorted(set(config.test_families) & set(config.validation_families))
-            if unknown or both:
+            in_both = sorted(set(config.test_families) & set(config.validation_families))
+            if unknown or in_both:
                 raise UserError(
-                    f"held-out families {unknown or both}: "
+                    f"held-out families {unknown or in_both}: "
                     + (f"known are {', '.join(sorted(FAMILIES))}" if unknown else "each can be held out in one split only")
                 )
             return [Item(f"{family}-{number:03d}") for family in FAMILIES for number in range(config.per_family)]

@@ -122,11 +122,11 @@ class Decimate(MapStage):
         (draft.files / "objects.json").write_bytes(pack_json(listed))
         summary: dict[str, Any] = {"objects": len(listed), "splits": dict(sorted(Counter(splits.values()).items()))}
         for budget in sorted(config.budgets):
-            reached = [meta["rungs"][str(budget)] for meta in metas.values() if str(budget) in meta["rungs"]]
+            measures = [meta["rungs"][str(budget)] for meta in metas.values() if str(budget) in meta["rungs"]]
             names = ("distance", "kept", "area_spread", "min_angle_deg", "slivers", "crossing", "flipped")
             summary[f"rung_{budget}"] = {
-                "objects": len(reached),
-                **{name: catalogue.spread([m[name] for m in reached]) for name in names},
+                "objects": len(measures),
+                **{name: catalogue.spread([m[name] for m in measures]) for name in names},
             }
         draft.note("summary", summary)
         _write_contact_sheet(inputs, draft, sorted(metas), sorted(config.budgets, reverse=True))

@@ -257,9 +257,9 @@ def split_objects(shard: Artifact, split: str) -> dict[str, str]:
 
 def training_objects(config: TrainConfig, shard: Artifact) -> TrainingObjects:
     """What the finished model has seen. Imported scenes do not say which objects they show, so their list is not complete."""
-    own = split_objects(shard, "train")
+    seen_objects = split_objects(shard, "train")
     before = TrainingObjects({}) if config.init_from is None else TrainingObjects.read(initial_folder(config.init_from))
-    return TrainingObjects(before.objects | own, before.complete and bool(own))
+    return TrainingObjects(before.objects | seen_objects, before.complete and bool(seen_objects))
 
 
 def check_objects(setting: str, folder: Path, shard: Artifact, say: Callable[[str], None]) -> None:
@@ -294,8 +294,8 @@ def start(model: RenderFormer, config: TrainConfig) -> None:
     from model.renderformer import checkpoint
 
     other, _ = checkpoint.load(initial_folder(config.init_from))
-    own, theirs = model.config.to_dict(), other.config.to_dict()
-    different = [f"{name} {theirs[name]} instead of {own[name]}" for name in own if own[name] != theirs[name]]
+    expected, actual = model.config.to_dict(), other.config.to_dict()
+    different = [f"{name} {actual[name]} instead of {expected[name]}" for name in expected if expected[name] != actual[name]]
     if different:
         raise UserError(f"train.init_from={config.init_from} is another network: {', '.join(different)} (choose model=...)")
     model.load_state_dict(other.state_dict())

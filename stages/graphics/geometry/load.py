@@ -178,8 +178,8 @@ def _parse(data: bytes, kind: str, materials: Any = None) -> list[_Part]:
     import trimesh
 
     options: dict[str, Any] = {"skip_materials": materials is None} if kind == ".obj" else {}
-    known = colours.library_without_images(materials) if kind == ".obj" and materials is not None else None
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind[1:], process=False, resolver=_Nothing(known), **options)
+    library = colours.library_without_images(materials) if kind == ".obj" and materials is not None else None
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind[1:], process=False, resolver=_Nothing(library), **options)
     parts = []
     for name in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[name]

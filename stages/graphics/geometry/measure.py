@@ -186,10 +186,10 @@ class Visibility:
             if not len(open_):
                 break
             side = np.sign(normals[open_] @ chunk.T)  # (n, 8)
-            asked = np.ones_like(side, bool) if two_sided else side > 0
-            which, ray = np.nonzero(asked & (side != 0))
-            index = open_[which]
-            origins = points[index] + (side[which, ray, None] * self.offset) * normals[index]
+            sides = np.ones_like(side, bool) if two_sided else side > 0
+            point_row, ray = np.nonzero(sides & (side != 0))
+            index = open_[point_row]
+            origins = points[index] + (side[point_row, ray, None] * self.offset) * normals[index]
             hit = self.scene.run(origins.astype(np.float32), chunk[ray].astype(np.float32), query="OCCLUDED")
             visible[index[np.asarray(hit) != 0]] = True
         return visible

@@ -172,12 +172,12 @@ def visible_components(surface: np.ndarray, triangles: np.ndarray, min_area_shar
         order = np.argsort(component, kind="stable")
         counts = np.bincount(component)
         rank = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
-        asked = order[(rank % np.maximum(1, np.repeat(counts, counts) // 200) == 0) & keep[component[order]]]
-        vectors = measure.face_vectors(surface, triangles[asked])
+        sampled_triangles = order[(rank % np.maximum(1, np.repeat(counts, counts) // 200) == 0) & keep[component[order]]]
+        vectors = measure.face_vectors(surface, triangles[sampled_triangles])
         normals = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
-        centres = measure.corners_of(surface, triangles[asked]).mean(axis=1)
+        centres = measure.corners_of(surface, triangles[sampled_triangles]).mean(axis=1)
         seen = measure.Visibility(surface, triangles).outer(centres, normals, two_sided=False)
-        keep &= np.bincount(component[asked], seen, minlength=len(keep)) > 0
+        keep &= np.bincount(component[sampled_triangles], seen, minlength=len(keep)) > 0
     if not keep.any():
         raise Reject("hidden")
     return measure.compact(surface, triangles[keep[component]])

@@ -179,8 +179,8 @@ def choose(choice: str = "auto", previous: dict[str, Any] | None = None) -> dict
             if candidate["backend"] == "scalar" and choice == "auto":
                 log.warning("no JIT backend of Mitsuba works here, rendering with scalar_rgb: %s", INSTALL)
             return candidate
-    wanted = {"cuda": "an NVIDIA GPU and its driver", "llvm": "libLLVM 16 or newer, or DRJIT_LIBLLVM_PATH naming one"}
-    raise UserError(f"backend={choice} does not work here: it needs {wanted[choice]}; backend=auto takes what works")
+    needs = {"cuda": "an NVIDIA GPU and its driver", "llvm": "libLLVM 16 or newer, or DRJIT_LIBLLVM_PATH naming one"}
+    raise UserError(f"backend={choice} does not work here: it needs {needs[choice]}; backend=auto takes what works")
 
 
 def _title(backend: dict[str, Any]) -> str:

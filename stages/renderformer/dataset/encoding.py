@@ -73,9 +73,9 @@ def encode_scene(scene: SceneRecord) -> bytes:
     reflectance = np.concatenate([arrays["diffuse"], arrays["specular"], arrays["roughness"][:, None]], axis=1)
     materials, material = _unique_rows(reflectance.astype(np.float16))
     emits = np.nonzero(arrays["emission"].any(axis=1))[0]
-    emission, which = _unique_rows(arrays["emission"][emits])
+    emission, emission_row = _unique_rows(arrays["emission"][emits])
     emission_index = np.full(len(arrays["emission"]), -1)
-    emission_index[emits] = which
+    emission_index[emits] = emission_row
     out = {
         "vertices": vertices,
         "origin": origin.astype(np.float32),

@@ -111,9 +111,9 @@ class Batches:
             for first in range(start, len(order), config.bucket * batch):
                 pool = order[first : first + config.bucket * batch]
                 pool = pool[np.argsort(counts[pool], kind="stable")]
-                whole = len(pool) // batch * batch
-                shuffled = rng.permutation(pool[:whole].reshape(-1, batch), axis=0).reshape(-1)
-                order[first : first + len(pool)] = np.concatenate([shuffled, pool[whole:]])
+                in_batches = len(pool) // batch * batch
+                shuffled = rng.permutation(pool[:in_batches].reshape(-1, batch), axis=0).reshape(-1)
+                order[first : first + len(pool)] = np.concatenate([shuffled, pool[in_batches:]])
         return order
 
     def padding_waste(self, first_step: int, steps: int) -> float:
@@ -144,8 +144,8 @@ class Batches:
     def _augmented(self, index: int, epoch: int) -> Batch:
         config, row = self.config, self.dataset.row(index)
         rng = np.random.default_rng(seed_for(config.seed, "augment", f"{epoch}/{row['id']}"))
-        kept, wanted = np.array(row["views"]), config.views_per_scene
-        views = rng.choice(kept, size=wanted, replace=wanted > len(kept))
+        kept_views, view_count = np.array(row["views"]), config.views_per_scene
+        views = rng.choice(kept_views, size=view_count, replace=view_count > len(kept_views))
         sample = self.dataset.read(index, views, self.layers, None)
         factors = draw_light_factors(config.lighting, rng, sample.scene.n_lights) if config.relight else None
         example = make_example(sample, views, factors, self.layers)
@@ -231,9 +231,9 @@ def _by_processes(batches: Callable[[int], Batch], start: int, stop: int | None,
     from torch.utils.data import DataLoader
 
     dataset = getattr(batches, "dataset", None)
-    whole = getattr(dataset, "cache_bytes", 0)
+    cache_bytes = getattr(dataset, "cache_bytes", 0)
     if dataset is not None:
-        dataset.cache_bytes = whole // workers  # every process has its own
+        dataset.cache_bytes = cache_bytes // workers  # every process has its own
     try:
         rows = iter(
             DataLoader(
@@ -248,7 +248,7 @@ def _by_processes(batches: Callable[[int], Batch], start: int, stop: int | None,
         )
     finally:
         if dataset is not None:
-            dataset.cache_bytes = whole
+            dataset.cache_bytes = cache_bytes
     for batch, error in rows:
         if error is not None:
             raise UserError(error)

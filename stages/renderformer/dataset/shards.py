@@ -264,11 +264,11 @@ class ShardDataset:
         """The sample with these views (None: all), their lights, and their AOVs if any ``layers`` are wanted;
         ``dtype`` None: half floats, as stored."""
         row = self.row(index)
-        wanted = row["views"] if views is None else sorted({int(view) for view in views})
+        chosen_views = row["views"] if views is None else sorted({int(view) for view in views})
         with Reader(self, row) as reader:
             scene = self._cached((index, "scene"), lambda: decode_scene(row["id"], reader["scene.npz"], reader["meta.json"]))
             out = {}
-            for view in wanted:
+            for view in chosen_views:
                 image, aov = view_members(view)
                 where = f"{image} of {row['id']}"
                 lights, meta = self._cached((index, image, dtype), lambda n=image, w=where: decode_lights(reader[n], w, dtype))

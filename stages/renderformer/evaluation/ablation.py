@@ -85,10 +85,10 @@ def jobs_of(table: str, names: Sequence[str] | None, overrides: Sequence[str]) -
 
     if table not in tables():
         raise UserError(f"table {table!r} is unknown: choose from {', '.join(tables())}")
-    known = [row.name for row in ROWS]
-    if unknown := [name for name in names or () if name not in known]:
-        raise UserError(f"row {', '.join(unknown)} is unknown: choose from {', '.join(known)}")
-    rows = [name for name in known if names is None or name in names]
+    row_names = [row.name for row in ROWS]
+    if unknown := [name for name in names or () if name not in row_names]:
+        raise UserError(f"row {', '.join(unknown)} is unknown: choose from {', '.join(row_names)}")
+    rows = [name for name in row_names if names is None or name in names]
     expanded = expand([*words(table, rows), *overrides])
     if len(expanded) != len(rows):
         raise UserError("a table is a sweep over its rows alone: give each override one value")
@@ -125,10 +125,10 @@ def sweep(table: str, names: Sequence[str] | None, overrides: Sequence[str], out
         at_once = ["jobs=1" if choose_device("auto", "") == "cuda" else f"jobs={min(len(jobs), os.cpu_count() or 1)}"]
     status = run_main([*words(table, order), *overrides, *at_once, "-m"])
     if split_config(next(iter(jobs.values())).root)[0].plan:
-        known = [one for one in costs.values() if one]
+        known_costs = [one for one in costs.values() if one]
         print(
-            f"in all: {len(known)} rows, {sum(one.flops for one in known):.2e} FLOPs of training, "
-            f"{sum(one.days for one in known):.3g} days of one A100"
+            f"in all: {len(known_costs)} rows, {sum(one.flops for one in known_costs):.2e} FLOPs of training, "
+            f"{sum(one.days for one in known_costs):.3g} days of one A100"
         )
         return status
     return status if status == INTERRUPTED else max(status, write_table(table, names, overrides, out))
@@ -197,13 +197,14 @@ def settings(job: Job, full: Job | None, result: Result | None) -> dict[str, str
             ("relighting", train.relight), ("exposure", train.exposure_stops),
         ) if on
     ]  # fmt: skip
-    asked = scene.count.model_dump() if hasattr(scene, "count") else {}  # imported scenes are as many as there are files
-    scene_counts = result.metrics["data"]["scenes"] if result else asked
+    # imported scenes have no count: there are as many as files
+    requested_counts = scene.count.model_dump() if hasattr(scene, "count") else {}
+    scene_counts = result.metrics["data"]["scenes"] if result else requested_counts
     scenes = scene_counts.get("train", 0)
     loss = "L1 of log10(1 + x)" + (f", {train.lpips:g} LPIPS" if train.lpips else "")
     peak = f"learning rate {train.lr:g}" + (f", {train.muon_lr:g} of matrices" if train.optimizer == "muon" else "")
     start = "informed" if train.informed_start is True else "random"
-    test = f"{asked.get('test', 0):,} scenes asked for"
+    test = f"{requested_counts.get('test', 0):,} scenes asked for"
     if result:
         test = f"{result.metrics['scenes']:,} scenes, {result.metrics['views']:,} views"
     largest = train.max_triangles or getattr(scene, "max_triangles", None)
@@ -212,7 +213,7 @@ def settings(job: Job, full: Job | None, result: Result | None) -> dict[str, str
     size = f"{model.num_layers} + {model.view_transformer_n_layers} layers, width {model.latent_dim}" if model else "–"
     return {
         "training scenes": f"{scenes:,}",
-        "objects": config["collect"].name if asked else "of imported scenes",
+        "objects": config["collect"].name if requested_counts else "of imported scenes",
         "triangles per scene, at most": f"{largest:,}" if largest else "any",
         "images": f"{render.resolution} px{views}",
         "samples per pixel, at most": f"{render.max_spp:,}",

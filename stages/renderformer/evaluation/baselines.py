@@ -70,16 +70,16 @@ def mean_images(blocks: Iterable[np.ndarray], limit: int) -> dict[str, np.ndarra
     floats, (limit, H, W, 3): that is why the number is bounded.
     """
     sums: dict[str, np.ndarray] = {}
-    held = np.empty(0, dtype=np.float16)
+    log_images = np.empty(0, dtype=np.float16)
     count = 0
     for block in blocks:
         block = block[: limit - count]
         if not count:
-            held = np.empty((limit, *block.shape[1:]), dtype=np.float16)
+            log_images = np.empty((limit, *block.shape[1:]), dtype=np.float16)
             sums = {name: np.zeros(block.shape[1:]) for name in ("linear", "tone_mapped")}
-        if block.shape[1:] != held.shape[1:]:
-            raise UserError(f"training images of {block.shape[1:]} and {held.shape[1:]}: a mean image needs one size")
-        held[count : count + len(block)] = SPACES["log"].encode(block)
+        if block.shape[1:] != log_images.shape[1:]:
+            raise UserError(f"training images of {block.shape[1:]} and {log_images.shape[1:]}: a mean image needs one size")
+        log_images[count : count + len(block)] = SPACES["log"].encode(block)
         for name, total in sums.items():
             total += SPACES[name].encode(block).sum(axis=0, dtype=np.float64)
         count += len(block)
@@ -89,7 +89,7 @@ def mean_images(blocks: Iterable[np.ndarray], limit: int) -> dict[str, np.ndarra
         raise UserError("there is no training image to average")
     encoded = {name: total / count for name, total in sums.items()}
     # Row by row: the median of half floats is taken in float32, one row of all images at a time.
-    encoded["log"] = np.stack([np.median(held[:count, y].astype(np.float32), axis=0) for y in range(held.shape[1])])
+    encoded["log"] = np.stack([np.median(log_images[:count, y].astype(np.float32), axis=0) for y in range(log_images.shape[1])])
     return {name: SPACES[name].decode(values).astype(np.float32) for name, values in encoded.items()}
 
 
@@ -102,9 +102,9 @@ def measure_baseline(
     """
     scores = {}
     for space, candidate in candidates.items():
-        asked = {name: metric for name, metric in metrics.items() if metric.space in (space, None)}
+        space_metrics = {name: metric for name, metric in metrics.items() if metric.space in (space, None)}
         image = np.broadcast_to(candidate, references.shape[1:])
-        scores[space] = [measure_all(reference, image, asked) for reference in references]
+        scores[space] = [measure_all(reference, image, space_metrics) for reference in references]
 
     def total(metric: Metric, space: str) -> float:
         return sum(row[metric.name] for row in scores[space]) * (1 if metric.higher_is_better else -1)

@@ -49,8 +49,8 @@ def noise_pairs(shard: Artifact, split: str) -> tuple[list[list[dict[str, float]
             scene_pairs.append([pair for pair in pairs if pair is not None])
         return [pairs for pairs in scene_pairs if pairs]
 
-    own = of(shard.ids(split))
-    return (own, split) if sum(map(len, own)) >= ENOUGH else (of(shard.ids()), "all splits")
+    split_pairs = of(shard.ids(split))
+    return (split_pairs, split) if sum(map(len, split_pairs)) >= ENOUGH else (of(shard.ids()), "all splits")
 
 
 def ceiling(scenes: Sequence[Scene], split: str, pairs: Sequence[Sequence[Mapping[str, float]]], where: str) -> dict[str, Any]:

@@ -111,7 +111,7 @@ def summary_table(runs: Sequence[Run], metrics: Mapping[str, Metric]) -> Table:
     """Rows are metrics; columns the runs and what they are seen against. The best is marked where scenes are the same."""
     columns = tables.columns(runs)
     best = tables.best_of(columns, metrics) if tables.all_same(runs) else dict.fromkeys(metrics)
-    known = [(number, column) for number, column in enumerate(columns) if column["values"]]
+    filled = [(number, column) for number, column in enumerate(columns) if column["values"]]
 
     def heading(number: int, column: Mapping[str, Any]) -> Cell:
         is_model = column["kind"] == "model"
@@ -127,8 +127,8 @@ def summary_table(runs: Sequence[Run], metrics: Mapping[str, Metric]) -> Table:
         kind = "best" if best[name] == number else "soft" if column["kind"] in ("direct", "ceiling") else ""
         return Cell(*tables.format_estimate(metrics[name], column["values"][name]), kind=kind)
 
-    rows = [[metric.heading, *(score(name, *column) for column in known)] for name, metric in metrics.items()]
-    return Table(["metric", *(heading(*column) for column in known)], rows, numeric=True)
+    rows = [[metric.heading, *(score(name, *column) for column in filled)] for name, metric in metrics.items()]
+    return Table(["metric", *(heading(*column) for column in filled)], rows, numeric=True)
 
 
 def difference_table(runs: Sequence[Run], differences: Mapping[str, Any], metrics: Mapping[str, Metric]) -> Table:

@@ -37,8 +37,8 @@ def write_report(
     if not out.parent.is_dir():
         raise UserError(f"{out.parent} is not a folder: make it first")
     beside = [out.with_suffix(suffix) for suffix in (".json", ".md")]
-    if not out.exists() and (taken := [path.name for path in beside if path.exists()]):
-        raise UserError(f"{' and '.join(taken)} would be replaced, and there is no report {out.name}: give another name")
+    if not out.exists() and (existing := [path.name for path in beside if path.exists()]):
+        raise UserError(f"{' and '.join(existing)} would be replaced, and there is no report {out.name}: give another name")
     runs, probes = load(words, store)
     if not different_data:
         check_same(runs)
@@ -57,23 +57,23 @@ def load(words: Sequence[str], store: Store) -> tuple[list[Run], list[Probe]]:
     """Runs and probes in the order in which they were given."""
     from stages.renderformer.evaluation.runs import load_probe, load_run
 
-    given: list[tuple[str, Artifact]] = []
+    named_artifacts: list[tuple[str, Artifact]] = []
     for word in words:
         name, _, reference = word.rpartition("=")
         artifact = store.resolve(reference)
         if artifact.stage not in ("evaluate", "probe"):
             raise UserError(f"{reference} is an artifact of stage {artifact.stage}: a report shows those of evaluate and probe")
-        given.append((name, artifact))
-    for key, count in Counter(artifact.key for _, artifact in given).items():
+        named_artifacts.append((name, artifact))
+    for key, count in Counter(artifact.key for _, artifact in named_artifacts).items():
         if count > 1:
             raise UserError(f"{key[:12]} is given {count} times: once is enough")
-    evaluated = [(name, artifact) for name, artifact in given if artifact.stage == "evaluate"]
+    evaluated = [(name, artifact) for name, artifact in named_artifacts if artifact.stage == "evaluate"]
     names = [name or default for (name, _), default in zip(evaluated, default_names(evaluated), strict=True)]
     for name, count in Counter(names).items():
         if count > 1:
             raise UserError(f"{count} runs are called {name!r}: give NAME=KEY")
     runs = [load_run(artifact, name) for name, (_, artifact) in zip(names, evaluated, strict=True)]
-    return runs, [load_probe(artifact) for _, artifact in given if artifact.stage == "probe"]
+    return runs, [load_probe(artifact) for _, artifact in named_artifacts if artifact.stage == "probe"]
 
 
 def default_names(evaluated: Sequence[tuple[str, Artifact]]) -> list[str]:

@@ -93,9 +93,9 @@ def best_of(columns: Sequence[Mapping[str, Any]], metrics: Mapping[str, Metric])
     """Per metric the column of the best mean among models and bars."""
     best = {}
     for name, metric in metrics.items():
-        known = [i for i, column in enumerate(columns) if column["kind"] in ("model", "bar") and name in column["values"]]
+        comparable = [i for i, column in enumerate(columns) if column["kind"] in ("model", "bar") and name in column["values"]]
         best[name] = (max if metric.higher_is_better else min)(
-            known, key=lambda i, name=name: columns[i]["values"][name]["mean"]
+            comparable, key=lambda i, name=name: columns[i]["values"][name]["mean"]
         )
     return best
 
@@ -165,14 +165,14 @@ def side_by_side(runs: Sequence[Run], probes: Sequence[Probe]) -> str:
     lines = []
     if runs:
         metrics = metrics_of([run.summary for run in runs])
-        known = [column for column in columns(runs) if column["values"]]
-        best = best_of(known, metrics) if all_same(runs) else dict.fromkeys(metrics)
+        filled = [column for column in columns(runs) if column["values"]]
+        best = best_of(filled, metrics) if all_same(runs) else dict.fromkeys(metrics)
         cells = [
-            [metric.heading, *(_cell(metric, column["values"].get(name), best[name] == i) for i, column in enumerate(known))]
+            [metric.heading, *(_cell(metric, column["values"].get(name), best[name] == i) for i, column in enumerate(filled))]
             for name, metric in metrics.items()
         ]
         lines = ["Mean over views [95 % interval over scenes]", ""]
-        lines += table(["metric", *(column["label"] for column in known)], cells, numeric=True)
+        lines += table(["metric", *(column["label"] for column in filled)], cells, numeric=True)
         by_run = differences(runs)
         if by_run:
             first = next(iter(by_run.values()))

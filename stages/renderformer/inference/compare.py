@@ -33,16 +33,17 @@ MARGIN, LINE = 8, 20
 
 @dataclass
 class Comparison:
-    """Two (H, W, 3) linear images, what they are (``names``, and ``labels`` in a picture), and how they differ.
+    """Two (H, W, 3) linear images, and how they differ.
 
-    metrics: name -> value, of `measure_all`; ``known`` says what these are.
+    names: of the images, such as their paths. labels: of the images in a picture.
+    metrics: name -> value, of `measure_all`. definitions: what each of these names means.
     """
 
     reference: np.ndarray
     test: np.ndarray
     names: tuple[str, str]
     metrics: dict[str, float]
-    known: Mapping[str, Metric] = field(default_factory=lambda: METRICS)
+    definitions: Mapping[str, Metric] = field(default_factory=lambda: METRICS)
     notes: list[str] = field(default_factory=list)
     labels: tuple[str, str] = ("reference", "test")
 
@@ -65,7 +66,7 @@ class Comparison:
             "",
         ]
         for name, value in self.metrics.items():
-            metric = self.known[name]
+            metric = self.definitions[name]
             better = "higher" if metric.higher_is_better else "lower"
             lines.append(f"{metric.label:<18} {metric.format(value):>9} {metric.unit:<2}  {better} is better".rstrip())
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
@@ -85,8 +86,8 @@ class Comparison:
         }
         times = max(1, -(-PANEL // self.reference.shape[1]))
         height, width = (times * side for side in self.reference.shape[:2])
-        metrics = [f"{self.known[name].label} {self.known[name].format(value)} {self.known[name].unit}".strip()
-                   for name, value in self.metrics.items()]  # fmt: skip
+        scores = [(self.definitions[name], value) for name, value in self.metrics.items()]
+        metrics = [f"{metric.label} {metric.format(value)} {metric.unit}".strip() for metric, value in scores]
         footer = [f"{label}: {name}" for label, name in zip(self.labels, self.names, strict=True)] + ["    ".join(metrics)]
         size = len(panels) * (width + MARGIN) + MARGIN, height + (1 + len(footer)) * LINE + 3 * MARGIN
         page = Image.new("RGB", size, "white")

@@ -233,8 +233,8 @@ def _camera(template: str, points: np.ndarray) -> Camera:
     position = look_at + CAMERA_DISTANCE * direction
     camera = Camera(direction.tolist(), look_at.tolist(), CAMERA_DISTANCE, position.tolist(), [0.0, 0.0, 1.0], 0.0)
     seen = (points - position) @ camera_to_world(camera)[:3, :3]
-    needed = 2 * np.degrees(np.arctan(np.abs(seen[:, :2] / seen[:, 2:]).max() / FILLED))
-    return replace(camera, fov_deg=float(np.clip(needed, *law.fov_deg)))
+    fov_deg = 2 * np.degrees(np.arctan(np.abs(seen[:, :2] / seen[:, 2:]).max() / FILLED))
+    return replace(camera, fov_deg=float(np.clip(fov_deg, *law.fov_deg)))
 
 
 COLOUR_GRID = 4  # points per side of a triangle that its colour is the mean of

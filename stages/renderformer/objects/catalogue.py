@@ -36,7 +36,7 @@ def hash_fraction(content_hash: str) -> float:
 
 
 def fill_splits(
-    objects: list[dict[str, Any]], held: Mapping[str, str], duplicates: Mapping[str, Iterable[str]] | None = None
+    objects: list[dict[str, Any]], fixed_splits: Mapping[str, str], duplicates: Mapping[str, Iterable[str]] | None = None
 ) -> dict[str, str]:
     """object_id -> split. ``held`` places some objects already; hash fractions place the others, by ``BOUNDS``.
 
@@ -59,7 +59,7 @@ def fill_splits(
     Raises UserError where a split stays under ``LEAST``.
     """
     number = len(objects)
-    splits = {name: split for name, split in held.items() if split != "train"}
+    splits = {name: split for name, split in fixed_splits.items() if split != "train"}
     fractions = {
         o["object_id"]: max(hash_fraction(h) for h in (o["content_hash"], *(duplicates or {}).get(o["object_id"], ())))
         for o in objects
@@ -78,7 +78,7 @@ def fill_splits(
         uneven = ", and the hashes of so few are uneven" if number >= 3 * LEAST else ""
         raise UserError(
             f"{number} distinct usable meshes ({stated}): train, validation and test need at least {LEAST} each, so at least "
-            f"{3 * LEAST} in all{uneven}; add meshes{' or hold out fewer families' if held else ''}"
+            f"{3 * LEAST} in all{uneven}; add meshes{' or hold out fewer families' if fixed_splits else ''}"
         )
     return splits
 

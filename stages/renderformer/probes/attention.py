@@ -113,8 +113,8 @@ class Attention(Probe):
         lit = scene.light_index >= 0
         weight_rows = []
         for number, bundle in enumerate(bundles):
-            own = np.unique(tiles[bundle])
-            own = own[own >= 0]
+            bundle_triangles = np.unique(tiles[bundle])
+            bundle_triangles = bundle_triangles[bundle_triangles >= 0]
             objects = scene.object_index[tiles[bundle][tiles[bundle] >= 0]]
             on_object = scene.meta["objects"][np.bincount(objects).argmax()]["name"] if len(objects) else "nothing"
             for layer, row in enumerate(weights[:, number]):
@@ -125,7 +125,7 @@ class Attention(Probe):
                         "on": on_object,  # what most of its pixels see
                         "layer": layer,
                         "registers": float(row[:registers].sum()),
-                        "own": float(on[own].sum()),
+                        "own": float(on[bundle_triangles].sum()),
                         "lights": float(on[lit].sum()),
                         "effective": float(np.exp(-np.sum(row * np.log(np.maximum(row, 1e-12))))),
                     }

@@ -190,16 +190,16 @@ def bisected(scene: SceneRecord, count: int) -> SceneRecord:
         size[scene.light_index >= 0] = 0
         if scene.textured:
             size[scene.patch_index >= 0] = 0
-        wanted = min(count - len(size), int((size > 0).sum()), max(1, len(size) // 4))
-        if wanted == 0:
+        cut_count = min(count - len(size), int((size > 0).sum()), max(1, len(size) // 4))
+        if cut_count == 0:
             break
-        chosen = np.argsort(-size, kind="stable")[:wanted]
+        chosen = np.argsort(-size, kind="stable")[:cut_count]
         corners, normals = _longest_first(scene.triangles[chosen], scene.vertex_normals[chosen])
         middle = corners[:, :2].mean(axis=1)
         normal = normals[:, :2].sum(axis=1)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
         doubled = rows(scene, np.concatenate([np.arange(len(size)), chosen]))
-        for first, keep in ((chosen, 0), (np.arange(len(size), len(size) + wanted), 1)):
+        for first, keep in ((chosen, 0), (np.arange(len(size), len(size) + cut_count), 1)):
             # corner 0 or 1 stays, the other of the two becomes the middle
             for array, values, new in ((doubled.triangles, corners, middle), (doubled.vertex_normals, normals, normal)):
                 half = values.copy()

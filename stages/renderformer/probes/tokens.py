@@ -94,30 +94,30 @@ class Tokens(Probe):
         config = worker.config
         truth = {row.id: unpack_arrays(draft.read(row.id).members["texels.npz"]) for row in draft.rows()}
         scenes = {id: worker.base(id) for id in truth}
-        fit, held = draft.ids(config.fit_split), draft.ids(config.split)
+        fit_ids, test_ids = draft.ids(config.fit_split), draft.ids(config.split)
         tokens = {id: tokens_of(worker.model, scene, worker.device) for id, scene in scenes.items()}
         decoded: dict[str, dict[str, np.ndarray]] = {}
         for stage, name in enumerate(("tokens that enter the encoder", "tokens that leave it")):
-            decoder = fit_decoder([(*tokens[id][stage], truth[id]) for id in fit], config)
-            decoded[name] = {id: decode(decoder, *tokens[id][stage], truth[id]["faces"], config.size) for id in held}
-        every = np.concatenate([truth[id]["radiance"][truth[id]["met"]] for id in fit]).astype(np.float32)
+            decoder = fit_decoder([(*tokens[id][stage], truth[id]) for id in fit_ids], config)
+            decoded[name] = {id: decode(decoder, *tokens[id][stage], truth[id]["faces"], config.size) for id in test_ids}
+        every = np.concatenate([truth[id]["radiance"][truth[id]["met"]] for id in fit_ids]).astype(np.float32)
         grey = np.median(every, axis=0)
         decoded["nothing: the colour that fits all best"] = {
-            id: np.broadcast_to(grey, truth[id]["radiance"].shape) for id in held
+            id: np.broadcast_to(grey, truth[id]["radiance"].shape) for id in test_ids
         }
         decoded["the truth: each triangle's own mean"] = {
-            id: np.broadcast_to(means(truth[id]["radiance"], truth[id]["met"]), truth[id]["radiance"].shape) for id in held
+            id: np.broadcast_to(means(truth[id]["radiance"], truth[id]["met"]), truth[id]["radiance"].shape) for id in test_ids
         }
         rows = []
         for name, by_scene in decoded.items():
-            errors = {id: errors_of(by_scene[id], truth[id]["radiance"], truth[id]["met"]) for id in held}
-            estimates = [bootstrap([[errors[id][part]] for id in held], METRICS["log_error"].bounds) for part in range(3)]
+            errors = {id: errors_of(by_scene[id], truth[id]["radiance"], truth[id]["met"]) for id in test_ids}
+            estimates = [bootstrap([[errors[id][part]] for id in test_ids], METRICS["log_error"].bounds) for part in range(3)]
             rows.append([name, *(with_interval(value, "{:.4f}".format) for value in estimates)])
         columns = [self.setting, "log error of texels", "of triangles' means", "of what varies within triangles"]
-        fitted, judged = (sum(int(truth[id]["met"].any(axis=(1, 2)).sum()) for id in ids) for ids in (fit, held))
+        fitted, judged = (sum(int(truth[id]["met"].any(axis=(1, 2)).sum()) for id in ids) for ids in (fit_ids, test_ids))
         notes = [
-            f"Decoder fitted to {fitted:,} triangles of {len(fit)} {config.fit_split} scenes in {config.steps} steps, judged "
-            f"on {judged:,} triangles of {len(held)} {config.split} scenes, {config.size} x {config.size} texels at "
+            f"Decoder fitted to {fitted:,} triangles of {len(fit_ids)} {config.fit_split} scenes in {config.steps} steps, "
+            f"judged on {judged:,} triangles of {len(test_ids)} {config.split} scenes, {config.size} x {config.size} texels at "
             f"{config.spp} samples each; 95 % intervals over scenes.",
             "Error: mean absolute difference of log10(1 + radiance), of the diffuse part that leaves a triangle's front. "
             "Tokens that enter the encoder know shape, place and material of their own triangle only.",
@@ -126,7 +126,7 @@ class Tokens(Probe):
         ]
         if not worker.model.config.num_layers:
             notes.append("This network has no view-independent layers: both kinds of token are the same.")
-        figure = self._figure(config, worker, draft, held[:SHOWN], scenes, truth, decoded)
+        figure = self._figure(config, worker, draft, test_ids[:SHOWN], scenes, truth, decoded)
         return Outcome(columns, rows, figure, notes)
 
     def _figure(
@@ -156,9 +156,9 @@ class Tokens(Probe):
                 show_picture(axes, to_picture(image, exposure), titles[column] if number == 0 else "")
             # triangles that vary most within themselves among those that are large in the picture
             pixels = np.array([(texels["seen"] == face).sum() for face in texels["faces"]])
-            whole = texels["met"].sum(axis=(1, 2)) >= 0.9 * texels["met"].sum(axis=(1, 2)).max()
+            uncovered = texels["met"].sum(axis=(1, 2)) >= 0.9 * texels["met"].sum(axis=(1, 2)).max()
             spread = np.where(texels["met"], texels["radiance"].astype(np.float32).mean(axis=-1), np.nan)
-            large = np.flatnonzero(whole & (pixels >= np.percentile(pixels[whole], 50)))
+            large = np.flatnonzero(uncovered & (pixels >= np.percentile(pixels[uncovered], 50)))
             order = large[np.argsort(-np.nan_to_num(np.nanstd(spread[large], axis=(1, 2))), kind="stable")][:SWATCHES]
             below = outer[2 * number + 1].subgridspec(3, SWATCHES)
             for column, face in enumerate(order):

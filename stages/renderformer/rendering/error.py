@@ -31,25 +31,25 @@ class Judge:
     def __init__(self, target: float, denoised: bool):
         self.target, self.network = target, "fast" if denoised else None
 
-    def error(self, a: ViewRecord, b: ViewRecord, whole: ViewRecord) -> tuple[str | None, float]:
+    def error(self, a: ViewRecord, b: ViewRecord, all_samples: ViewRecord) -> tuple[str | None, float]:
         """(network, error) of the image with all lights on, from the views of both halves and of all samples, not denoised:
         the small network where it meets the target, the large one otherwise, None where nothing is to be denoised."""
         if self.network is None:
             return None, 0.5 * log_error(a.image, b.image)
         if self.network == "fast":
-            error = denoised_error(a, b, whole, "fast")
+            error = denoised_error(a, b, all_samples, "fast")
             if error <= self.target:
                 return "fast", error
             if HOPE * error > self.target:
                 return "high", error * HIGH
             self.network = "high"  # if this does not do, the small one will not do with a few samples more
-        return "high", denoised_error(a, b, whole, "high")
+        return "high", denoised_error(a, b, all_samples, "high")
 
 
-def denoised_error(a: ViewRecord, b: ViewRecord, whole: ViewRecord, quality: str) -> float:
+def denoised_error(a: ViewRecord, b: ViewRecord, all_samples: ViewRecord, quality: str) -> float:
     """Of the image with all lights on as that network makes it, from the views of both halves and of all samples."""
     first, second, now = (
-        log_encode(denoise(v.image, v.albedo, v.normal, v.coverage, quality).astype(np.float64)) for v in (a, b, whole)
+        log_encode(denoise(v.image, v.albedo, v.normal, v.coverage, quality).astype(np.float64)) for v in (a, b, all_samples)
     )
     noise, drift = np.abs(first - second).mean(), np.abs((first + second) / 2 - now).mean()
     return float(QUALITIES[quality] * (NOISE_WEIGHT * noise + DRIFT_WEIGHT * drift))

@@ -125,8 +125,8 @@ class Guide(Unguided):
         return dr.lerp(pdf, share * (BINS / (4 * np.pi)), spot.share)
 
     def direction(self, wo, spot, si, u, v):
-        taken = u.x < spot.share
-        return dr.select(taken, si.to_local(self._draw(dr.select(taken, spot.cell, 0), u.y, v)), wo)
+        guided = u.x < spot.share
+        return dr.select(guided, si.to_local(self._draw(dr.select(guided, spot.cell, 0), u.y, v)), wo)
 
     def _draw(self, cell: mi.UInt32, pick: mi.Float, v: mi.Point2f) -> mi.Vector3f:
         bin_index, step = mi.UInt32(0), BINS // 2

@@ -48,7 +48,7 @@ def render_views(
     renderer = _renderer(scene, settings, backend)
     records = {}
     active = list(range(len(scene.camera_to_world))) if views is None else list(views)
-    order, taken = list(active), 0
+    order, sampled_spp = list(active), 0
     # With a target, two streams that share no path: what tells noise from image.
     streams = [0, 1] if target_error > 0 and max_spp > 1 else [0]
     total = max_spp // len(streams)  # of each stream
@@ -57,33 +57,33 @@ def render_views(
     judges = {view: Judge(target_error, denoise) for view in active}
     due = dict.fromkeys(active, 0.0)  # samples of a stream before which an estimate is not worth its cost
     while active:
-        if taken:
+        if sampled_spp:
             renderer.learn(active)
-        sampled = renderer.sample(active, streams, taken, step)
-        taken += step
-        left = []
+        sampled = renderer.sample(active, streams, sampled_spp, step)
+        sampled_spp += step
+        unfinished = []
         for view, new in zip(active, zip(*sampled, strict=True), strict=True):
             of_streams = parts[view] = (
                 [before + more for before, more in zip(parts[view], new, strict=True)] if parts[view] else list(new)
             )
-            if 1.5 * taken <= due[view] and taken < total:  # even the next count would not do
-                left.append(view)
+            if 1.5 * sampled_spp <= due[view] and sampled_spp < total:  # even the next count would not do
+                unfinished.append(view)
                 continue
             sums = functools.reduce(operator.add, of_streams)
-            whole, *halves = (part.view(scene.object_index) for part in (sums, *of_streams))
+            all_samples, *halves = (part.view(scene.object_index) for part in (sums, *of_streams))
             quality, error = "high" if denoise else None, None
             if len(halves) > 1:
-                quality, error = judges[view].error(*halves, whole)
-            if taken == total or error is None or error <= target_error:
-                records[view] = _finish(whole, sums, view, quality, error, len(streams) * taken - sums.spp)
+                quality, error = judges[view].error(*halves, all_samples)
+            if sampled_spp == total or error is None or error <= target_error:
+                records[view] = _finish(all_samples, sums, view, quality, error, len(streams) * sampled_spp - sums.spp)
                 del parts[view]
                 continue
-            left.append(view)
-            if renderer.guided and taken == step and total >= 2 * taken and error > FAR * target_error:
+            unfinished.append(view)
+            if renderer.guided and sampled_spp == step and total >= 2 * sampled_spp and error > FAR * target_error:
                 parts[view] = []  # guided samples are so much better that these would only harm
             else:  # no error falls faster than by the square root, and denoised ones do not reach it
-                due[view] = taken + ((error / target_error) ** (2.5 if denoise else 2.0) - 1) * of_streams[0].spp
-        active, step = left, min(_next(taken) - taken, total - taken)
+                due[view] = sampled_spp + ((error / target_error) ** (2.5 if denoise else 2.0) - 1) * of_streams[0].spp
+        active, step = unfinished, min(_next(sampled_spp) - sampled_spp, total - sampled_spp)
     return [records[view] for view in order]
 
 

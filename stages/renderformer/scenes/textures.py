@@ -68,8 +68,8 @@ def look_up(image: np.ndarray, uv: np.ndarray, wrap: tuple[int, int] = (0, 0)) -
         x = np.clip(x, 0, 1) * size - 0.5
         low = np.floor(x).astype(np.int64)
         part = (x - low).astype(np.float32)[:, None]
-        both = np.stack([low, low + 1])
-        cells.append((both % size if mode == "repeat" else both.clip(0, size - 1), part))
+        ends = np.stack([low, low + 1])
+        cells.append((ends % size if mode == "repeat" else ends.clip(0, size - 1), part))
     (columns, right), (rows, down) = cells
     upper, lower = (
         _LINEAR[image[rows[side], columns[0]]] * (1 - right) + _LINEAR[image[rows[side], columns[1]]] * right for side in (0, 1)
