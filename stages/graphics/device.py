@@ -6,7 +6,10 @@ from pipeline.errors import UserError
 
 
 def choose_device(choice: str, setting: str) -> str:
-    """``wanted`` auto: CUDA where there is one, else the CPU. ``setting`` names where a person changes it, for errors."""
+    """The device to use: cpu or cuda. ``choice`` auto takes CUDA where there is one, else the CPU.
+
+    ``setting`` is the name of the choice in errors.
+    """
     import torch
 
     if choice == "auto":

@@ -1,9 +1,9 @@
 """``lightmill compare``: how far a test image is from a reference, as numbers and as a picture.
 
 ``compare A B`` takes two image files: EXR (linear radiance; a view's lights are summed) or 8-bit PNG (sRGB, made linear).
-``compare SCENE --checkpoint C`` makes both: the reference is path traced as the training data is (lights hidden from the
-camera), the test image is predicted from the same arrays. One design choice: both end in the same function, and the metrics
-are all those of ``stages.graphics.metrics``, so that a figure typed here can be set beside a report's.
+``compare SCENE --checkpoint C`` makes both images. The reference is path traced as the training data is, with lights hidden
+from the camera. The test image is predicted from the same arrays. One design choice: both commands measure all metrics of
+``stages.graphics.metrics`` by the same function, so that a number from here can be set beside a report's.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Comparison:
         }
 
     def table(self) -> str:
-        """As text for a terminal."""
+        """The comparison as text for a terminal."""
         lines = [
             f"{self.labels[0]:<10} {self.names[0]}",
             f"{self.labels[1]:<10} {self.names[1]}",
@@ -104,8 +104,10 @@ class Comparison:
 
 
 def error_pictures(reference: np.ndarray, test: np.ndarray, exposure: float) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 3) uint8: the difference of the two as pictures of that exposure, times `DIFFERENCE_GAIN`, and the HDR-FLIP map
-    of the linear images in its own colours."""
+    """Two (H, W, 3) uint8 pictures: the absolute difference, and the HDR-FLIP map in its own colours.
+
+    The difference is of the two images as sRGB pictures at that exposure, times `DIFFERENCE_GAIN`.
+    """
     import matplotlib
 
     difference = np.abs(srgb_encode(test * exposure) - srgb_encode(reference * exposure)) * DIFFERENCE_GAIN
@@ -114,7 +116,7 @@ def error_pictures(reference: np.ndarray, test: np.ndarray, exposure: float) -> 
 
 
 def compare_images(a: Path | str, b: Path | str, metrics: Mapping[str, Metric] = METRICS) -> Comparison:
-    """Two image files, ``a`` the reference."""
+    """A comparison of two image files; ``a`` is the reference."""
     paths = Path(a), Path(b)
     reference, test = (read_image(path) for path in paths)
     try:
@@ -136,7 +138,7 @@ def compare_scene(
     room: Room | None = None,
     metrics: Mapping[str, Metric] = METRICS,
 ) -> Comparison:
-    """One camera of a scene or mesh file: path traced with ``spp`` samples and denoised, and predicted."""
+    """A comparison of one camera of a scene or mesh file: path traced with ``spp`` samples and denoised, and predicted."""
     from stages.graphics.mitsuba.backend import choose
     from stages.renderformer.rendering.render import render_views
     from stages.renderformer.rendering.settings import RenderSettings
@@ -163,7 +165,7 @@ def compare_scene(
 
 
 def check_picture(out: Path, inputs: Sequence[Path]) -> None:
-    """UserError unless the comparison's picture can be written there: told before anything is computed."""
+    """UserError unless the comparison's picture can be written there. Called before anything is computed."""
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the picture must end in .png")
     if not out.parent.is_dir():

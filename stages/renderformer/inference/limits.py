@@ -1,8 +1,7 @@
-"""What the training data holds, so that a scene beyond it is rendered with a warning that names the limit.
+"""Limits of the training data. A scene beyond one of them is rendered, with a warning that names the limit.
 
-Reads arrays, writes nothing. The numbers are those of the laws that the released data was drawn by
-(``stages.renderformer.scenes.laws``; the paper's sections 3.3 and 4.2 name them as limits), except what a checkpoint itself
-says it was trained with.
+Reads arrays, writes nothing. Numbers come from the laws of the released data (``stages.renderformer.scenes.laws``; paper
+sections 3.3 and 4.2). Triangles and resolution come from the checkpoint, if it says what it was trained with.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from stages.renderformer.scenes.meshes import areas
 RELEASED_TRIANGLES = 4096  # of the released training data, for checkpoints that do not say (section 2)
 RELEASED_RESOLUTION = 512
 REACH = 1.1  # scene units from the centre, per axis: objects of the largest scale at the edge of the room
+UNSCALED_LIGHT_AREA = 0.0022  # scene units squared, of the light triangle before a law scales it
 ROUND = 1.001  # what is drawn at a limit may lie beyond it by rounding
 
 
@@ -28,7 +28,7 @@ def triangle_limit(trained_with: Mapping[str, str]) -> int:
 
 
 def resolution_limit(trained_with: Mapping[str, str]) -> int:
-    """Pixels per side of the images that it was trained with."""
+    """Pixels per side of the images that the checkpoint was trained with."""
     return int(trained_with.get("resolution", RELEASED_RESOLUTION))
 
 
@@ -39,9 +39,10 @@ def beyond_limits(
     trained_with: Mapping[str, str],
     composite_lights: bool = False,
 ) -> list[str]:
-    """A sentence for each limit of the training data that the scene, seen by ``views`` at (height, width) pixels, is beyond.
+    """One sentence for each limit of the training data that the scene is beyond.
 
-    ``composite_lights``: it is rendered light by light, so that their number is no limit.
+    ``views``: numbers of the cameras to render. ``resolution``: (height, width) in pixels. ``composite_lights``: lights are
+    rendered one by one, so their number is no limit.
     """
     return [
         *_size(scene, resolution, trained_with),
@@ -52,23 +53,24 @@ def beyond_limits(
 
 
 def light_radiance(scene: SceneRecord) -> np.ndarray:
-    """(L,) radiance of each light, the mean over its area and the colour channels."""
+    """(L,) radiance of each light: mean over its area and over the colour channels."""
     emits = scene.light_index >= 0
-    size, light = areas(scene.triangles[emits]), scene.light_index[emits]
-    power = np.bincount(light, size * scene.emission[emits].mean(axis=1, dtype=np.float64), minlength=scene.n_lights)
-    return power / np.maximum(np.bincount(light, size, minlength=scene.n_lights), 1e-12)
+    area, light = areas(scene.triangles[emits]), scene.light_index[emits]
+    power = np.bincount(light, area * scene.emission[emits].mean(axis=1, dtype=np.float64), minlength=scene.n_lights)
+    return power / np.maximum(np.bincount(light, area, minlength=scene.n_lights), 1e-12)
 
 
 def _outside(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Values outside [low, high] by more than rounding."""
     return values[(values * ROUND < low) | (values > high * ROUND)]
 
 
-def _worst(values: np.ndarray, low: float, high: float, what: str, unit: str = "", digits: int = 2) -> Iterator[str]:
-    """One sentence, of the value that is farthest outside."""
-    bad = _outside(np.asarray(values, np.float64), low, high)
-    if len(bad):
-        worst = bad[np.argmax(np.maximum(low / np.maximum(bad, 1e-12), bad / high))]
-        yield f"{what} {worst:,.{digits}f}{unit}: the training data has {low:,.{digits}f} to {high:,.{digits}f}{unit}"
+def _worst(values: np.ndarray, low: float, high: float, quantity: str, unit: str = "", digits: int = 2) -> Iterator[str]:
+    """One sentence about the value farthest outside [low, high]; nothing if all are inside."""
+    outside = _outside(np.asarray(values, np.float64), low, high)
+    if len(outside):
+        worst = outside[np.argmax(np.maximum(low / np.maximum(outside, 1e-12), outside / high))]
+        yield f"{quantity} {worst:,.{digits}f}{unit}: the training data has {low:,.{digits}f} to {high:,.{digits}f}{unit}"
 
 
 def _size(scene: SceneRecord, resolution: tuple[int, int], trained_with: Mapping[str, str]) -> Iterator[str]:
@@ -92,23 +94,24 @@ def _size(scene: SceneRecord, resolution: tuple[int, int], trained_with: Mapping
         yield f"a triangle of area {largest:.3f}: the training data's largest have about {LARGEST_TRIANGLE:.3f} (subdivide it)"
 
 
-def _lights(scene: SceneRecord, one_by_one: bool) -> Iterator[str]:
+def _lights(scene: SceneRecord, composite_lights: bool) -> Iterator[str]:
     law, emits = LightLaw(), scene.light_index >= 0
     count, (least, most) = scene.n_lights, law.count
-    if not least <= count <= most and not one_by_one:
+    if not least <= count <= most and not composite_lights:
         yield f"{count} lights: the training data has {least} to {most} (--composite-lights renders them one by one)"
     if count == 0:
         return
     emission, light = scene.emission[emits].astype(np.float64), scene.light_index[emits]
     triangles = scene.triangles[emits].astype(np.float64)
-    size = areas(triangles)
-    area = np.bincount(light, size, minlength=count)
+    triangle_area = areas(triangles)
+    light_area = np.bincount(light, triangle_area, minlength=count)
     low, high = law.radiance  # also of a light alone in its pass, which is made as bright as all together
     yield from _worst(np.array([light_radiance(scene).sum()]), low, high, "lights of a total radiance of", digits=0)
-    small = 0.0022 * law.scale[0] ** 2  # of the light triangle, before it is scaled
-    yield from _worst(area, small / 2, 2 * 0.0022 * law.scale[1] ** 2, "a light of area", digits=4)
-    centres = np.stack([np.bincount(light, size * triangles.mean(axis=1)[:, i], minlength=count) for i in range(3)], axis=1)
-    distance = np.linalg.norm(centres / np.maximum(area, 1e-12)[:, None], axis=1)
+    least_area, most_area = (UNSCALED_LIGHT_AREA * scale**2 for scale in law.scale)
+    yield from _worst(light_area, least_area / 2, 2 * most_area, "a light of area", digits=4)
+    weighted = triangle_area[:, None] * triangles.mean(axis=1)
+    centres = np.stack([np.bincount(light, weighted[:, axis], minlength=count) for axis in range(3)], axis=1)
+    distance = np.linalg.norm(centres / np.maximum(light_area, 1e-12)[:, None], axis=1)
     slack = float(np.sqrt(3) * law.target[1])  # the target is not the origin
     yield from _worst(distance, law.distance[0] - slack, law.distance[1] + slack, "a light", " from the origin")
     spread = float((emission.max(axis=1) - emission.min(axis=1)).max() / max(emission.max(), 1e-12))

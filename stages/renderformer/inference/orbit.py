@@ -1,8 +1,8 @@
 """Cameras around a scene: an orbit of one of its cameras, for animations (paper section 3.3).
 
 Reads and returns a ``SceneRecord``; only its cameras change. One design choice: the orbit is a full turn where nothing is in
-the way, else it swings between the walls: never far enough for a camera to see the backs of surfaces, which no training
-scene shows. Frame 0 is the scene's own camera, and the last frame leads back to it.
+the way, else it swings between the walls. It never shows the backs of surfaces, because no training scene does. Frame 0 is
+the scene's own camera, and the last frame leads back to it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ LEAST_DEG = 10.0  # to each side, however narrow the room
 def orbit(scene: SceneRecord, frames: int, view: int = 0, arc_deg: float | None = None) -> SceneRecord:
     """The scene with ``frames`` cameras: camera ``view`` turned about a vertical axis through what it looks at.
 
-    arc_deg: 360 for a full turn, less to swing that far in all; None: as far as nothing is in the way.
+    arc_deg: 360 is a full turn. With less, the camera swings that far in all. None: as far as nothing is in the way.
+    UserError: no frame, or an arc outside (0, 360].
     """
     if frames < 1:
         raise UserError(f"an orbit of {frames} frames: give at least 1")
@@ -47,7 +48,7 @@ def orbit(scene: SceneRecord, frames: int, view: int = 0, arc_deg: float | None 
 
 
 def centre(scene: SceneRecord, view: int) -> np.ndarray:
-    """(3,) the point on the camera's axis that is nearest to the middle of what does not emit, and in front of it."""
+    """(3,) the point on the camera's axis nearest to the middle of all that does not emit; always in front of the camera."""
     solid = scene.triangles[scene.light_index < 0].reshape(-1, 3)
     points = (solid if len(solid) else scene.triangles.reshape(-1, 3)).astype(np.float64)
     pose = scene.camera_to_world[view].astype(np.float64)
@@ -56,7 +57,7 @@ def centre(scene: SceneRecord, view: int) -> np.ndarray:
 
 
 def turned(pose: np.ndarray, pivot: np.ndarray, degrees: float) -> np.ndarray:
-    """(4, 4) the pose turned about the vertical axis through the pivot."""
+    """(4, 4) camera-to-world pose, turned about the vertical axis through the pivot."""
     about_z = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     out = pose.copy()
     out[:3] = about_z @ pose[:3]
@@ -65,7 +66,7 @@ def turned(pose: np.ndarray, pivot: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def free_arc(scene: SceneRecord, view: int, pivot: np.ndarray) -> tuple[float, float]:
-    """Degrees that the camera may turn back and ahead before it sees more backs of surfaces; (180, 180): all around."""
+    """Degrees that the camera may turn back and ahead until it sees more backs of surfaces. (180, 180): all around."""
     from stages.graphics.geometry.measure import embree_scene
 
     solid = np.flatnonzero(scene.light_index < 0)

@@ -1,7 +1,7 @@
-"""Scenes to images by a trained network: what *evaluate* and ``stages.renderformer.inference.renderer`` share.
+"""Scenes to images by a trained network. *evaluate*, the probes and ``stages.renderformer.inference.renderer`` share it.
 
-Reads a released-format checkpoint folder and scene records; gives linear HDR images. One design choice: a scene is encoded once
-and its views are decoded from the same tokens a few at a time (section 3.1), so that memory does not grow with their number.
+Reads a released-format checkpoint folder and scene records, gives linear HDR images. One design choice: a scene is encoded
+once, and its views are decoded from the same tokens a few at a time (section 3.1). So memory does not grow with the views.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def load_model(folder: Path) -> RenderFormer:
 def predict_frames(
     model: RenderFormer, scene: SceneRecord, views: Sequence[int], resolution: int | tuple[int, int], device: Any = "cpu"
 ) -> Iterator[np.ndarray]:
-    """(H, W, 3) float32 linear radiance of the scene's cameras ``views``, at least 0, one after the other."""
+    """(H, W, 3) float32 linear radiance, at least 0, of each of the scene's cameras ``views``, in order."""
     import torch
 
     from model.renderformer.network import to_radiance
@@ -50,12 +50,12 @@ def predict_frames(
 def predict_scene(
     model: RenderFormer, scene: SceneRecord, views: Sequence[int], resolution: int, device: Any = "cpu"
 ) -> np.ndarray:
-    """(V, H, W, 3): all of ``predict_frames``."""
+    """(V, H, W, 3) float32 linear radiance: all images of ``predict_frames`` in one array."""
     return np.stack(list(predict_frames(model, scene, views, resolution, device)))
 
 
 def single_lights(scene: SceneRecord) -> Iterator[SceneRecord]:
-    """The scene under each of its lights alone; the others stay as what an unlit light is, a surface that reflects nothing."""
+    """The scene under each of its lights alone. The other lights stay as black surfaces, as an unlit light is."""
     for light in range(scene.n_lights):
         off = (scene.light_index >= 0) & (scene.light_index != light)
         dark = {
@@ -65,10 +65,10 @@ def single_lights(scene: SceneRecord) -> Iterator[SceneRecord]:
 
 
 def light_passes(scene: SceneRecord) -> Iterator[tuple[SceneRecord, float]]:
-    """For each light the scene under it alone, made as bright as all lights together, and its share of that.
+    """One pass per light: the scene under that light alone, as bright as all lights together, and the light's share of that.
 
-    The image is the sum over passes of share times prediction. Without the exposure, which light transport takes back exactly,
-    each pass of many would be darker than anything that a network was trained with (docs/probes.md, probe=lights).
+    The image is the sum over passes of share times prediction. This is exact, because light transport is linear. Without
+    brightening, each of many passes would be darker than all training scenes (docs/probes.md, probe=lights).
     """
     radiance = light_radiance(scene)
     shares = radiance / radiance.sum()

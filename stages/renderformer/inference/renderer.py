@@ -30,7 +30,7 @@ MAX_SIDE = 8192  # pixels
 
 
 class LimitWarning(UserWarning):
-    """A scene is beyond what the checkpoint was trained with: it is rendered all the same."""
+    """A scene is beyond a limit of the training data. It is rendered all the same."""
 
 
 # --- checkpoints --------------------------------------------------------------------------------------------------------------
@@ -47,7 +47,10 @@ def shipped_checkpoint() -> Path:
 
 
 def checkpoint_folder(reference: Path | str | None, store: Path | str = "store") -> Path:
-    """A released-format checkpoint folder as given, or that of a train artifact in the store; None: the one that ships."""
+    """The released-format folder of a checkpoint.
+
+    ``reference``: such a folder, or a train artifact in the store. None: the model that ships. UserError: it is neither.
+    """
     if reference is None:
         return shipped_checkpoint()
     folder = Path(reference)
@@ -75,8 +78,9 @@ def checkpoint_folder(reference: Path | str | None, store: Path | str = "store")
 class Renderer:
     """A trained network that renders scenes.
 
-    checkpoint: a released-format folder, or a train artifact (``"train"``: the newest in ``store``); None: what ships.
-    device: cpu, cuda or auto.
+    checkpoint: a released-format folder, or a train artifact (``"train"``: the newest in ``store``). None: the model that
+        ships. device: cpu, cuda or auto.
+    triangles, resolution: most triangles of a scene, and pixels per side, that the checkpoint was trained with.
     """
 
     def __init__(self, checkpoint: Path | str | None = None, device: str = "auto", store: Path | str = "store"):
@@ -87,8 +91,8 @@ class Renderer:
         self.folder = checkpoint_folder(checkpoint, store)
         self.device = choose_device(device, "--device")
         self.model, self.trained_with = files.load(self.folder)
-        self.triangles = triangle_limit(self.trained_with)  # of a scene; beyond, expect worse images
-        self.resolution = resolution_limit(self.trained_with)  # pixels per side, what is rendered unless told otherwise
+        self.triangles = triangle_limit(self.trained_with)
+        self.resolution = resolution_limit(self.trained_with)
 
     def load(self, path: Path | str, room: Room | None = None) -> SceneRecord:
         """A scene file, or a mesh file in its room. A room without a limit of triangles gets that of the training data."""
@@ -103,19 +107,22 @@ class Renderer:
         self, scene: SceneRecord | Path | str, view: int = 0, resolution: int | tuple[int, int] | None = None,
         composite_lights: bool = False,
     ) -> np.ndarray:  # fmt: skip
-        """(H, W, 3) float32 linear radiance of one camera; the arguments as of `frames`."""
+        """(H, W, 3) float32 linear radiance of one camera. Arguments are those of `frames`."""
         return next(self.frames(scene, [view], resolution, composite_lights))
 
     def frames(
         self, scene: SceneRecord | Path | str, views: Sequence[int] | None = None,
         resolution: int | tuple[int, int] | None = None, composite_lights: bool = False,
     ) -> Iterator[np.ndarray]:  # fmt: skip
-        """(H, W, 3) float32 linear radiance of each of the cameras ``views`` (None: all), in order, as they are asked for.
+        """(H, W, 3) float32 linear radiance of each of the cameras ``views`` (None: all), in order, rendered when asked for.
 
-        resolution: pixels per side, or (height, width), multiples of 8 (of 64 with a Swin view stage); None: what the
-        network was trained with. composite_lights: one pass per light, summed: exact for a path tracer (light transport is
-        linear), and for a network a way to more lights than it was trained with. Warns (`LimitWarning`) of each limit of
-        the training data that the scene is beyond.
+        resolution: pixels per side, or (height, width), multiples of 8 (of 64 with a Swin view stage). None: what the
+            network was trained with.
+        composite_lights: one pass per light, summed. Light transport is linear, so the sum is exact for a path tracer. A
+            network can render more lights in this way than it was trained with.
+
+        Warns (`LimitWarning`) of each limit of the training data that the scene is beyond. UserError: a camera or a
+        resolution that does not exist; for ``composite_lights``, a scene without light.
         """
         from stages.renderformer.inference.limits import beyond_limits
         from stages.renderformer.inference.scene_files import check_lit
@@ -134,7 +141,7 @@ class Renderer:
         return self._frames(scene, views, size, composite_lights)
 
     def _size(self, resolution: int | tuple[int, int]) -> tuple[int, int]:
-        """(height, width), as the network can have it."""
+        """(height, width). UserError where the network cannot render that."""
         size = (resolution, resolution) if isinstance(resolution, int) else (int(resolution[0]), int(resolution[1]))
         multiple = self.model.config.resolution_multiple
         for side in size:

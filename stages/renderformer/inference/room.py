@@ -1,10 +1,10 @@
 """A mesh file as a scene: the default room, lights and camera around one object.
 
-Reads a mesh file (``stages.graphics.geometry.load``); returns a ``SceneRecord``. The room is one of the templates that the
-training scenes are drawn from, with every number inside the released ranges (paper section 3.3), so that a model sees what it
-knows: the object stands on the floor, its front to the camera, under three white lights. Design choice: an object of more
-triangles than there is room for goes through *remesh* and *decimate* themselves, with their defaults, and so becomes an
-object like those of the training data; one of few large triangles is subdivided as far as there is room.
+Reads a mesh file (``stages.graphics.geometry.load``), returns a ``SceneRecord``. The object stands on the floor, its front to
+the camera, under three white lights. The room is a template of the training scenes, with every number inside the released
+ranges (paper section 3.3), so that a model sees what it knows. Design choice: an object of too many triangles goes through
+*remesh* and *decimate* with their defaults. So it becomes an object like those of the training data. One of few large
+triangles is subdivided as far as the limit of triangles allows.
 """
 
 from __future__ import annotations
@@ -88,16 +88,18 @@ def room_scene(path: Path, room: Room) -> SceneRecord:
     original = normalise(loaded.vertices).astype(np.float64), loaded.faces
     template = room.template or _template(triangles, len(loaded.faces))
     walls = TEMPLATES[template]
-    spare = None if triangles is None else max(triangles - WALL_FACES * len(walls) - len(LIGHTS), LEAST_FACES // 2)
+    object_faces = None  # at most
+    if triangles is not None:
+        object_faces = max(triangles - WALL_FACES * len(walls) - len(LIGHTS), LEAST_FACES // 2)
     notes = [f"{path.name}: {note}" for note in loaded.notes]
     mesh = _welded(*original)
-    if spare is not None and len(mesh[1]) > spare:
-        mesh, how = decimated(*original, spare)
+    if object_faces is not None and len(mesh[1]) > object_faces:
+        mesh, how = decimated(*original, object_faces)
         notes.append(f"{path.name}: {len(original[1]):,} triangles {how} to {len(mesh[1]):,}, of {triangles:,} in the scene")
 
     turn = UP[room.up or ("z" if path.suffix.lower() in Z_UP else "y")]
     placement = _object(mesh[0], turn)
-    while spare is not None and 4 * len(mesh[1]) <= spare and _largest(mesh, placement) > LARGEST_TRIANGLE:
+    while object_faces is not None and 4 * len(mesh[1]) <= object_faces and _largest(mesh, placement) > LARGEST_TRIANGLE:
         mesh = trimesh.remesh.subdivide(*mesh)
         placement = _object(mesh[0], turn)  # another mean of the vertices
     camera = _camera(template, place(normalize(mesh[0]), placement))
@@ -115,18 +117,18 @@ def _largest(mesh: meshes.Mesh, placement: Placement) -> float:
 
 
 def _template(triangles: int | None, faces: int) -> str:
-    """The room with the most walls that leaves the object enough."""
+    """Name of the room with the most walls that leaves enough triangles for the object's ``faces``."""
     for name in ("corner", "wall"):
-        left = np.inf if triangles is None else triangles - WALL_FACES * len(TEMPLATES[name]) - len(LIGHTS)
-        if left >= min(faces, 2 * LEAST_FACES):
+        for_object = np.inf if triangles is None else triangles - WALL_FACES * len(TEMPLATES[name]) - len(LIGHTS)
+        if for_object >= min(faces, 2 * LEAST_FACES):
             return name
     return "floor"
 
 
 def decimated(vertices: np.ndarray, faces: np.ndarray, budget: int) -> tuple[meshes.Mesh, str]:
-    """The mesh with at most ``budget`` faces, and how it came about.
+    """The mesh with at most ``budget`` faces, and words for how it was made.
 
-    As *remesh* and *decimate* do it; a mesh that they refuse is collapsed as it is.
+    *remesh* and *decimate* make it. A mesh that they reject is collapsed as it is. UserError: that leaves too many faces.
     """
     from pipeline.stage import Item, Record
     from stages.graphics.geometry import decimator
@@ -134,7 +136,7 @@ def decimated(vertices: np.ndarray, faces: np.ndarray, budget: int) -> tuple[mes
     from stages.renderformer.s01_remesh import Remesh, RemeshConfig
     from stages.renderformer.s02_decimate import Decimate, DecimateConfig
 
-    class Held(dict):
+    class OneRecord(dict):
         """One record in the place of an artifact."""
 
         def read(self, id: str) -> Record:
@@ -142,11 +144,11 @@ def decimated(vertices: np.ndarray, faces: np.ndarray, budget: int) -> tuple[mes
 
     names = ("object_id", "content_hash", "family", "source", "origin", "licence")
     record = MeshRecord("mesh", vertices.astype(np.float32), faces.astype(np.int32), dict.fromkeys(names, "")).to_record()
-    collect, item = Held(mesh=record), Item("mesh")
+    collect, item = OneRecord(mesh=record), Item("mesh")
     try:
         (fine,) = Remesh().process((RemeshConfig(), collect), item)
         config = DecimateConfig(budgets=[budget])
-        (record,) = Decimate().process((config, {"collect": collect, "remesh": Held(mesh=fine)}), item)
+        (record,) = Decimate().process((config, {"collect": collect, "remesh": OneRecord(mesh=fine)}), item)
         ((vertices, faces),) = load_rungs(record).values()
         return (vertices.astype(np.float64), faces.astype(np.int64)), "remeshed and decimated"
     except Reject as error:
@@ -160,7 +162,7 @@ def decimated(vertices: np.ndarray, faces: np.ndarray, budget: int) -> tuple[mes
 
 
 def _welded(vertices: np.ndarray, faces: np.ndarray) -> meshes.Mesh:
-    """One vertex where several lie: files repeat them along texture seams, where shading is not to break."""
+    """The mesh with vertices at equal positions merged. Files repeat them along texture seams, where shading must not break."""
     points, index = np.unique(vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[faces]
     return points, faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
@@ -172,7 +174,7 @@ def _material(colour: Sequence[float], specular: float = 0.0, roughness: float =
 
 
 def _wall(name: str) -> Placement:
-    """Walls as wide as the law allows; the floor is raised so that object and camera fit as they do in the data."""
+    """A wall, as wide as the law allows. The floor is raised so that object and camera fit as they do in the data."""
     floor = name == "floor"
     law = laws.WallLaw()
     wide, near = law.scale[1], law.scale[0]
@@ -190,7 +192,10 @@ def _floor_height() -> float:
 
 
 def _object(vertices: np.ndarray, turn: Sequence[float]) -> Placement:
-    """Turned upright, its bounding box in the middle, its lowest point on the floor, ``RADIUS`` around the box's centre."""
+    """The object's placement: upright, centred, its lowest point on the floor, ``RADIUS`` around its bounding box's centre.
+
+    ``vertices``: (V, 3) as in the file. ``turn``: degrees about x, y and z that bring the file's up to z.
+    """
     placement = Placement(
         "object_0", "object", [float(angle) for angle in turn], [1.0] * 3, [0.0] * 3,
         _material(OBJECT_COLOUR, SPECULAR, ROUGHNESS, smooth=True),
@@ -225,7 +230,10 @@ def _turn_to(direction: np.ndarray) -> np.ndarray:
 
 
 def _camera(template: str, points: np.ndarray) -> Camera:
-    """Looks at the middle of the object's ``points``, as far as the law lets it, and opens until the object fills its share."""
+    """A camera that looks at the middle of the object's ``points`` (N, 3), with a field of view that the object fills well.
+
+    The camera law bounds both.
+    """
     law = laws.CameraLaw()
     direction = np.array(CAMERAS.get(template, CAMERA))
     direction /= np.linalg.norm(direction)
@@ -241,7 +249,10 @@ COLOUR_GRID = 4  # points per side of a triangle that its colour is the mean of
 
 
 def _coloured(scene: SceneRecord, texture: TextureRecord, original: meshes.Mesh, mesh: meshes.Mesh) -> SceneRecord:
-    """The object's triangles in the file's base colours: each the mean over the nearest points of the original."""
+    """The scene, its object in the file's base colours. A triangle's colour is the mean at the nearest points of the original.
+
+    ``original`` and ``mesh``: the object as in the file and as in the scene, (vertices, faces).
+    """
     from stages.renderformer.scenes.textures import nearest_colours, seen_faces
 
     vertices, faces = original

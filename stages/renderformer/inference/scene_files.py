@@ -1,8 +1,8 @@
-"""Files that are scenes, or become one: the one entrance of trace, predict and compare.
+"""Scene and mesh files as scenes, for trace, predict and compare.
 
-Reads the released formats (``stages.renderformer.scenes.released``) as they are, and plain meshes with a default room around
-them (``stages.renderformer.inference.room``). One design choice: what cannot give a picture is refused here, for all commands
-alike.
+Reads the released formats (``stages.renderformer.scenes.released``) as they are. A plain mesh gets a room around it
+(``stages.renderformer.inference.room``). One design choice: a file that cannot give a picture is refused here, so that all
+commands refuse it alike.
 """
 
 from __future__ import annotations
@@ -41,6 +41,6 @@ def load_scene(path: Path | str, room: Room | None = None) -> SceneRecord:
 
 
 def check_lit(scene: SceneRecord, name: Path | str) -> None:
-    """Raise UserError, with the scene's name, where nothing in it emits."""
+    """UserError, with the scene's ``name``, if nothing in it emits."""
     if not scene.emission.any():
         raise UserError(f"{name} has no light, its picture would be black: give an object an emissive colour above 0")

@@ -1,5 +1,6 @@
-"""``lightmill trace``: path trace a scene or mesh file (``stages.renderformer.inference.scene_files``), and write float
-EXR pictures.
+"""``lightmill trace``: path trace a scene or mesh file, and write float EXR images.
+
+``stages.renderformer.inference.scene_files`` reads the file.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ def trace(
     backend: str = "auto",
     room: Room | None = None,
 ) -> list[Path]:
-    """Write the view (or ``OUT-0.exr``, ``OUT-1.exr`` .. for all) as linear RGB and return the files' paths.
+    """Write the view as linear RGB; returns the paths. With ``view`` all, the files are ``OUT-0.exr``, ``OUT-1.exr`` ..
 
     ``room``: what a mesh gets around it.
     """

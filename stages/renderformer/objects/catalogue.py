@@ -1,8 +1,7 @@
-"""What is decided over all objects at once: record ids, duplicates, splits, and what a folder says about its files'
-licences.
+"""Decisions over all objects at once: record ids, duplicates, splits, and the licences that a folder's README states.
 
-Split rule (``fill_splits``): a fraction in [0, 1) made of an object's content hash says its split, so that the choice depends
-on no name, no order and no other object. Families that are held out go whole to their split.
+Split rule (``fill_splits``): an object's content hash gives a fraction in [0, 1), and the fraction gives the split. So the
+split depends on no name, no order and no other object. All objects of a held-out family go to the family's split.
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ def hash_fraction(content_hash: str) -> float:
 def fill_splits(
     objects: list[dict[str, Any]], fixed_splits: Mapping[str, str], duplicates: Mapping[str, Iterable[str]] | None = None
 ) -> dict[str, str]:
-    """object_id -> split. ``held`` places some objects already; hash fractions place the others, by ``BOUNDS``.
+    """object_id -> split. Hash fractions decide, by ``BOUNDS``, except for objects in ``fixed_splits`` (object_id -> split).
 
-    Where a split then has fewer than ``LEAST``, the objects of the next higher fractions fill it up: first test, then
-    validation. ``duplicates``: object_id -> content hashes of the meshes left out for it. The highest fraction counts.
+    A split with fewer than ``LEAST`` objects takes those of the next higher fractions: first test, then validation.
+    ``duplicates``: object_id -> content hashes of the meshes left out for it. The highest fraction counts.
 
     What holds when a set grows, with the same families held out:
 
@@ -94,8 +93,10 @@ def spread(values: list[float]) -> dict[str, float]:
 def find_duplicates(
     ids: list[str], signatures: np.ndarray, mesh: Callable[[str], tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, str]:
-    """id -> the earlier id with the same geometry. ``signatures`` (N, S); ``mesh`` reads the few that need
-    confirming."""
+    """id -> the earlier id with the same geometry.
+
+    Meshes of nearly equal ``signatures`` (N, S) are compared as surfaces. ``mesh`` reads (vertices, faces) of these few by id.
+    """
     from scipy.spatial import cKDTree
 
     same: dict[str, str] = {}
@@ -139,7 +140,7 @@ def read_notes(readme: Path) -> dict[str, str]:
 
 
 def note_for(relative: str, notes: Mapping[str, str]) -> str:
-    """The note of the nearest folder that has one."""
+    """The note of the nearest folder above the file that has one, else ''."""
     for folder in PurePosixPath(relative).parents:
         if folder.as_posix() in notes:
             return notes[folder.as_posix()]

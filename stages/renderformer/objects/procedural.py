@@ -1,8 +1,8 @@
-"""Families of made-up shapes, so that the pipeline runs where no mesh can be had.
+"""Families of made-up shapes. With them the pipeline runs without any mesh file.
 
-Each family is a function of a random generator; every call gives another member: proportions, counts, profiles and
-bends are drawn anew. Parts may overlap and need not be joined: remesh makes one closed surface of them. Any units, any
-placement, z up.
+A family is a function of a random generator. Each call draws proportions, counts, profiles and bends, and so gives another
+member. Parts may overlap and need not be joined, because remesh makes one closed surface of them. z is up; units and
+placement are free, because later stages normalise.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ def join(*parts: Mesh) -> Mesh:
 
 
 def moved(mesh: Mesh, offset: tuple[float, float, float] | np.ndarray) -> Mesh:
+    """The mesh, translated."""
     return mesh[0] + np.asarray(offset), mesh[1]
 
 
@@ -44,7 +45,7 @@ def turned(mesh: Mesh, axis: int, angle: float) -> Mesh:
 
 
 def quads(points: np.ndarray, wrap_rows: bool = False, wrap_columns: bool = False) -> Mesh:
-    """A (N, M, 3) grid of points as triangles."""
+    """Triangles of a (N, M, 3) grid of points. ``wrap_rows``, ``wrap_columns``: the last row or column joins the first."""
     n, m = points.shape[:2]
     index = np.arange(n * m).reshape(n, m)
     if wrap_rows:
@@ -56,7 +57,7 @@ def quads(points: np.ndarray, wrap_rows: bool = False, wrap_columns: bool = Fals
 
 
 def capped(rings: np.ndarray) -> Mesh:
-    """A (N, M, 3) stack of rings closed at both ends by fans to the rings' centres (rings star-shaped about them)."""
+    """A (N, M, 3) stack of rings, closed at both ends by fans to the rings' centres. Rings must be star-shaped about these."""
     n, m = rings.shape[:2]
     vertices, faces = quads(rings, wrap_columns=True)
     low, high = np.arange(m), np.arange(m) + (n - 1) * m
@@ -67,7 +68,7 @@ def capped(rings: np.ndarray) -> Mesh:
 
 
 def lathe(profile: np.ndarray, around: int = 48) -> Mesh:
-    """A (N, 2) profile of (radius, height) turned about z and capped."""
+    """A solid of revolution: a (N, 2) profile of (radius, height) turned about z, capped."""
     angle = np.arange(around) / around * TURN
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(around)], axis=-1)
     points = profile[:, None, :1] * ring + profile[:, None, 1:] * np.array([0, 0, 1.0])
@@ -75,7 +76,7 @@ def lathe(profile: np.ndarray, around: int = 48) -> Mesh:
 
 
 def tube(path: np.ndarray, radius: np.ndarray | float, around: int = 14, closed: bool = False) -> Mesh:
-    """A round tube along a (N, 3) path, with frames that do not twist; ``radius`` may vary along it."""
+    """A round tube along a (N, 3) path, with frames that do not twist. ``radius``: a number, or (N,) along the path."""
     n = len(path)
     tangent = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0) if closed else np.gradient(path, axis=0)
     tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -99,8 +100,10 @@ def tube(path: np.ndarray, radius: np.ndarray | float, around: int = 14, closed:
 
 
 def extrude(outline: np.ndarray, levels: np.ndarray, scales: np.ndarray | None = None, twist: float = 0.0) -> Mesh:
-    """A (M, 2) outline, star-shaped about the origin, at each height of ``levels``, scaled and turned on its way up,
-    capped."""
+    """A solid of one cross section: the (M, 2) outline, star-shaped about the origin, at the heights ``levels`` (N,), capped.
+
+    ``scales`` (N,): size of the outline at each height. ``twist``: its turn from bottom to top, in radians.
+    """
     levels = np.asarray(levels, float)
     scales = np.ones(len(levels)) if scales is None else np.asarray(scales)
     angle = twist * (levels - levels[0]) / max(np.ptp(levels), 1e-9)
@@ -114,7 +117,7 @@ def extrude(outline: np.ndarray, levels: np.ndarray, scales: np.ndarray | None =
 
 
 def ring(outer: np.ndarray, inner: np.ndarray, low: float, high: float) -> Mesh:
-    """The flat body between two (M, 2) outlines of as many points."""
+    """The flat body between two (M, 2) outlines with equally many points, from height ``low`` to ``high``."""
     loops = [(outer, low), (outer, high), (inner, high), (inner, low)]
     points = np.stack([np.column_stack([loop, np.full(len(loop), z)]) for loop, z in loops])
     return quads(points[::-1], wrap_rows=True, wrap_columns=True)
@@ -128,18 +131,19 @@ def box(size: tuple[float, float, float] | np.ndarray, centre: tuple[float, floa
 
 
 def circle(number: int, radius: float = 1.0) -> np.ndarray:
-    """(N, 2)."""
+    """(N, 2) points on a circle about the origin, counter-clockwise."""
     angle = np.arange(number) / number * TURN
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def sphere_grid(rows: int = 40, columns: int = 64) -> tuple[np.ndarray, np.ndarray]:
-    """(latitude (N, 1), longitude (1, M)) that leave the poles to the caps."""
+    """(latitude (N, 1), longitude (1, M)) in radians, without the poles: ``capped`` closes them."""
     latitude = (np.arange(rows) + 0.5) / rows * np.pi - np.pi / 2
     return latitude[:, None], (np.arange(columns) / columns * TURN)[None]
 
 
 def power(x: np.ndarray, exponent: float) -> np.ndarray:
+    """Power of the absolute value, with the sign of x."""
     return np.sign(x) * np.abs(x) ** exponent
 
 
@@ -364,7 +368,7 @@ def stairs(rng: np.random.Generator) -> Mesh:
 
 
 def rounded_box(rng: np.random.Generator) -> Mesh:
-    """A box with rounded edges, some with a shell's openings cut by recesses on top: keys, buttons or bricks."""
+    """A box with rounded edges, and often rows of round studs on top: keys, buttons or bricks."""
     latitude, longitude = sphere_grid(40, 64)
     direction = np.stack(
         [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude) + 0 * longitude],
@@ -519,7 +523,7 @@ def pattern(rng: np.random.Generator) -> np.ndarray:
 
 
 def box_coordinates(vertices: np.ndarray, faces: np.ndarray, repeats: float = 2.0) -> np.ndarray:
-    """(F, 3, 2) texture coordinates per corner: every face projected along the axis that its normal is nearest to.
+    """(F, 3, 2) texture coordinates of corners: each face is projected along the axis nearest to its normal.
 
     ``repeats``: how often a tile repeats along the longest side of the bounding box.
     """

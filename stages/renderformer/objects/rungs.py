@@ -1,5 +1,4 @@
-"""The record of *decimate*: one mesh per reached budget. Light to import: the scene stage reads rungs without any mesh
-library.
+"""The record of *decimate*: one mesh per budget that was reached. Loads no mesh library, because the scene stage imports it.
 
 Members: ``f0512.npz`` (vertices (V, 3) float32, faces (F, 3) int32) per rung, named by its budget, and ``meta.json``
 with ``rungs``: {"512": {faces, distance, kept, ...}}.
@@ -20,7 +19,7 @@ MEMBER = re.compile(r"f(\d+)\.npz\Z")
 
 
 def rungs_record(id: str, rungs: Mapping[int, tuple[np.ndarray, np.ndarray]], meta: dict[str, Any]) -> Record:
-    """budget -> (vertices, faces) as a record."""
+    """A record of rungs: budget -> (vertices (V, 3), faces (F, 3))."""
     members = {
         f"f{budget:04d}.npz": pack_arrays({"vertices": vertices.astype(np.float32), "faces": faces.astype(np.int32)})
         for budget, (vertices, faces) in sorted(rungs.items())
@@ -29,7 +28,7 @@ def rungs_record(id: str, rungs: Mapping[int, tuple[np.ndarray, np.ndarray]], me
 
 
 def load_rungs(record: Record) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """budget -> (vertices (V, 3) float32, faces (F, 3) int32), ascending."""
+    """Rungs of a record: budget -> (vertices (V, 3) float32, faces (F, 3) int32), budgets ascending."""
     rungs = {}
     for name in sorted(record.members):
         match = MEMBER.match(name)
@@ -40,5 +39,5 @@ def load_rungs(record: Record) -> dict[int, tuple[np.ndarray, np.ndarray]]:
 
 
 def rung_faces(meta: Mapping[str, Any]) -> dict[int, int]:
-    """budget -> faces, from a record's meta."""
+    """Number of faces of each rung, from a record's meta: budget -> faces, budgets ascending."""
     return {int(budget): rung["faces"] for budget, rung in sorted(meta["rungs"].items(), key=lambda pair: int(pair[0]))}
