@@ -102,8 +102,8 @@ def textured_patches(reflectance: Tensor, material: Tensor, patch: int) -> Tenso
 
 def encode_emission(material: Tensor) -> Tensor:
     """(T, C, ...): emission enters as log10(1 + e); a new tensor, so that nothing is encoded twice."""
-    rest, emission = material.split([material.shape[1] - EMISSION, EMISSION], dim=1)
-    return torch.cat([rest, torch.log10(1 + emission)], dim=1)
+    reflectance, emission = material.split([material.shape[1] - EMISSION, EMISSION], dim=1)
+    return torch.cat([reflectance, torch.log10(1 + emission)], dim=1)
 
 
 def scenes_of(batch: Mapping[str, Any], channels: int = 13, patch: int = 32, device: torch.device | str = "cpu") -> Triangles:

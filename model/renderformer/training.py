@@ -250,7 +250,7 @@ def fit(
     state = _State(model, config, folder, group)
     if state.load() and group.leads:
         say(f"going on from step {state.step:,} of {config.steps:,}")
-    parameters = [p for optimizer in state.optimizers for one in optimizer.param_groups for p in one["params"]]
+    parameters = [p for optimizer in state.optimizers for entry in optimizer.param_groups for p in entry["params"]]
     work = Work(model, group, precision)
     # Only the first process writes. All have read the state by now, and none goes on before the log is cut.
     log = TrainingLog(*((folder, tensorboard) if group.leads else (None, None)), state.step, config.steps,

@@ -19,15 +19,15 @@ LOG = "log.jsonl"
 
 def cut(path: Path, step: int) -> None:
     """Drop lines after ``step``, and a last one that a kill cut short."""
-    kept = []
+    lines = []
     for line in path.read_text().splitlines() if path.is_file() else []:
         try:
             row = json.loads(line)
         except ValueError:
             break
         if row["step"] <= step:
-            kept.append(line + "\n")
-    write_atomic(path, "".join(kept).encode())
+            lines.append(line + "\n")
+    write_atomic(path, "".join(lines).encode())
 
 
 class TrainingLog:
@@ -54,8 +54,8 @@ class TrainingLog:
         if self.events is not None:
             for name, value in row.items():
                 if name != "step" and value is not None:
-                    group, _, rest = name.rpartition("validation_")
-                    self.events.add_scalar(f"{'validation' if name != rest else 'train'}/{rest}", value, row["step"])
+                    group, _, metric = name.rpartition("validation_")
+                    self.events.add_scalar(f"{'validation' if name != metric else 'train'}/{metric}", value, row["step"])
             self.events.flush()
 
     def picture(self, name: str, picture: np.ndarray, step: int) -> None:

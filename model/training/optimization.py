@@ -34,9 +34,9 @@ def build_optimizers(
         hidden = set()
     elif name != "muon":
         raise InputError(f"optimizer={name!r} is unknown: adamw or muon")
-    rest = [(key, p) for key, p in named if key not in hidden]
-    decayed = [p for key, p in rest if p.ndim >= 2 and "token" not in key]
-    plain = [p for key, p in rest if not (p.ndim >= 2 and "token" not in key)]
+    others = [(key, p) for key, p in named if key not in hidden]
+    decayed = [p for key, p in others if p.ndim >= 2 and "token" not in key]
+    plain = [p for key, p in others if not (p.ndim >= 2 and "token" not in key)]
     groups = [{"params": decayed, "weight_decay": weight_decay}, {"params": plain, "weight_decay": 0.0}]
     optimizers: list[torch.optim.Optimizer] = [torch.optim.AdamW([g for g in groups if g["params"]], lr=lr, betas=(0.9, 0.95))]
     if hidden:

@@ -111,11 +111,11 @@ class Decimate(MapStage):
         from stages.renderformer.objects import catalogue
 
         metas = {row.id: unpack_json(draft.read(row.id).members["meta.json"]) for row in draft.rows()}
-        left = [o for o in _catalogue(inputs) if o["object_id"] in metas]
+        remaining = [o for o in _catalogue(inputs) if o["object_id"] in metas]
         # what was rejected on the way may have left a split short: it is filled up from train, by the same rule
-        splits = catalogue.fill_splits(left, {o["object_id"]: o["split"] for o in left})
+        splits = catalogue.fill_splits(remaining, {o["object_id"]: o["split"] for o in remaining})
         listed = []
-        for o in left:
+        for o in remaining:
             name = o["object_id"]
             rungs = {str(budget): faces for budget, faces in rung_faces(metas[name]).items()}
             listed.append({**o, "split": splits[name], "rungs": rungs})

@@ -98,10 +98,10 @@ class SceneWorker:
         if record is not None and "texture.npz" in record.members:
             source, texture = MeshRecord.from_record(self.collect.read(key[0])), TextureRecord.from_record(record)
             vertices, faces = self.mesh(entry, rung)
-            seen = textures.seen_faces(source.vertices, source.faces)
-            colours = textures.transfer(texture, source.vertices, source.faces, vertices[faces], seen).astype(np.float16)
+            visible = textures.seen_faces(source.vertices, source.faces)
+            colours = textures.transfer(texture, source.vertices, source.faces, vertices[faces], visible).astype(np.float16)
         self._colours[key] = colours
-        while sum(kept.nbytes for kept in self._colours.values() if kept is not None) > KEPT_COLOURS and len(self._colours) > 1:
+        while sum(a.nbytes for a in self._colours.values() if a is not None) > KEPT_COLOURS and len(self._colours) > 1:
             self._colours.popitem(last=False)
         return colours
 

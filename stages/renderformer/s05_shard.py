@@ -102,12 +102,12 @@ class Shard(MapStage):
         draft.note("shards", {split: {**shard, "parts": len(shard["parts"])} for split, shard in shards.items()})
 
     def check(self, draft: Any) -> None:
-        seen: dict[str, str] = {}
+        split_of_object: dict[str, str] = {}
         for split, ids in json.loads((draft.files / "objects.json").read_text()).items():
             for id in ids:
-                if seen.setdefault(id, split) != split:
+                if split_of_object.setdefault(id, split) != split:
                     raise UserError(
-                        f"object {id} is in the splits {seen[id]} and {split}: images of it would leak into the test"
+                        f"object {id} is in the splits {split_of_object[id]} and {split}: images of it would leak into the test"
                     )
 
 

@@ -293,12 +293,12 @@ def start(model: RenderFormer, config: TrainConfig) -> None:
         return
     from model.renderformer import checkpoint
 
-    other, _ = checkpoint.load(initial_folder(config.init_from))
-    expected, actual = model.config.to_dict(), other.config.to_dict()
+    initial, _ = checkpoint.load(initial_folder(config.init_from))
+    expected, actual = model.config.to_dict(), initial.config.to_dict()
     different = [f"{name} {actual[name]} instead of {expected[name]}" for name in expected if expected[name] != actual[name]]
     if different:
         raise UserError(f"train.init_from={config.init_from} is another network: {', '.join(different)} (choose model=...)")
-    model.load_state_dict(other.state_dict())
+    model.load_state_dict(initial.state_dict())
 
 
 def show(folder: Path, step: int, pairs: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:

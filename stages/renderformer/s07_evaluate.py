@@ -255,9 +255,9 @@ def visible_roughness(scene: SceneRecord, triangle: np.ndarray) -> float | None:
 
     triangle: (H, W), the triangle in each pixel, -1 for nothing. None where nothing that is seen is specular.
     """
-    seen = triangle[triangle >= 0]
-    weight = scene.specular.mean(axis=1)[seen].astype("float64")
-    return round(float(weight @ scene.roughness[seen] / weight.sum()), 4) if weight.any() else None
+    visible = triangle[triangle >= 0]
+    weight = scene.specular.mean(axis=1)[visible].astype("float64")
+    return round(float(weight @ scene.roughness[visible] / weight.sum()), 4) if weight.any() else None
 
 
 def network(checkpoint: Path) -> dict[str, int]:

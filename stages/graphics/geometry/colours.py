@@ -180,16 +180,16 @@ def parse_library(data: bytes) -> dict[str, dict[str, Any]]:
         words = line.strip().split(None, 1)
         if len(words) < 2:
             continue
-        key, rest = words[0].lower(), words[1].strip()
+        key, value = words[0].lower(), words[1].strip()
         if key == "newmtl":
-            current = materials.setdefault(" ".join(rest.split()), {})
+            current = materials.setdefault(" ".join(value.split()), {})
         elif key == "kd":
             with contextlib.suppress(ValueError):  # it may also name a spectrum
-                r, g, b = (float(np.nan_to_num(np.clip(float(word), 0, 1))) for word in rest.split()[:3])
+                r, g, b = (float(np.nan_to_num(np.clip(float(word), 0, 1))) for word in value.split()[:3])
                 current["colour"] = r, g, b
         elif key == "map_kd":
-            current["map"] = rest.split()[-1] if rest.startswith("-") else rest  # options come before the name
-            if re.search(r"-clamp\s+on", rest):
+            current["map"] = value.split()[-1] if value.startswith("-") else value  # options come before the name
+            if re.search(r"-clamp\s+on", value):
                 current["wrap"] = "clamp"
     return materials
 

@@ -213,8 +213,8 @@ def _look(mesh: Any, kind: str, materials: Any) -> tuple[colours.Material | None
         name = next((name for name in mesh.vertex_attributes if UV.match(name)), None)
         if name is None:
             return None, None
-        number, one = map(int, UV.match(name).groups())
-        look, uv = materials[number], np.asarray(mesh.vertex_attributes[name], np.float64) / one
+        number, full_scale = map(int, UV.match(name).groups())
+        look, uv = materials[number], np.asarray(mesh.vertex_attributes[name], np.float64) / full_scale
     usable = uv is not None and np.shape(uv) == (len(mesh.vertices), 2)
     return look, np.asarray(uv, np.float64) if usable else None
 
@@ -371,11 +371,11 @@ def _keep_uv(tree: dict[str, Any], primitive: dict[str, Any], stated: dict[str, 
     """Give the primitive its texture coordinates under a name that tells its material (positions where it has none)."""
     source = f"TEXCOORD_{coordinates}"
     accessor = tree["accessors"][stated[source]] if source in stated else {}
-    one = colours.INTEGER_UV.get(accessor.get("componentType"), 1) if accessor.get("normalized") else 1
-    primitive["attributes"][f"_M{number}_{one}"] = stated.get(source, stated["POSITION"])
+    full_scale = colours.INTEGER_UV.get(accessor.get("componentType"), 1) if accessor.get("normalized") else 1
+    primitive["attributes"][f"_M{number}_{full_scale}"] = stated.get(source, stated["POSITION"])
     draco = primitive["extensions"].get(DRACO, {}).get("attributes", {})
     if source in draco:
-        draco[f"_M{number}_{one}"] = draco.pop(source)
+        draco[f"_M{number}_{full_scale}"] = draco.pop(source)
 
 
 def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:

@@ -60,15 +60,15 @@ def make_example(sample: Sample, views: np.ndarray, factors: np.ndarray | None, 
     example |= {name: getattr(scene, name)[views] for name in ("camera_to_world", "fov_deg")}
     if scene.textured:
         example |= {name: getattr(scene, name) for name in PATCHES}
-    seen = [sample.views[int(view)] for view in views]
+    chosen_views = [sample.views[int(view)] for view in views]
     weights = np.ones((scene.n_lights, 3), np.float32) if factors is None else factors.astype(np.float32)
-    if seen:
-        example["image"] = _stacked([lit_by(view.lights, weights) for view in seen])
+    if chosen_views:
+        example["image"] = _stacked([lit_by(view.lights, weights) for view in chosen_views])
         for name in layers:
             if name != "direct" or factors is None:
-                if any(getattr(view, name) is None for view in seen):
+                if any(getattr(view, name) is None for view in chosen_views):
                     raise UserError(f"views of scene {scene.id} were read without layers: read them with layers=[{name!r}]")
-                example[name] = _stacked([getattr(view, name) for view in seen])
+                example[name] = _stacked([getattr(view, name) for view in chosen_views])
     if factors is not None:
         lit = scene.light_index >= 0
         example["emission"] = scene.emission.copy()
@@ -172,29 +172,29 @@ def collate(examples: Iterable[Batch], count: int) -> Batch:
     memory used again at once costs far less than fresh memory.
     """
     pixels: Batch = {}
-    rest: list[Batch] = []
+    small_arrays: list[Batch] = []
     for example in examples:
         for name in example.keys() & set(PIXELS):
             if name not in pixels:
                 pixels[name] = planes((count, *example[name].shape), example[name].dtype)
-            pixels[name][len(rest)] = example[name]
-        rest.append({name: None if name in pixels else value for name, value in example.items()})
+            pixels[name][len(small_arrays)] = example[name]
+        small_arrays.append({name: None if name in pixels else value for name, value in example.items()})
         del example
-    longest = max(len(example["mask"]) for example in rest)
-    batch: Batch = {"ids": [example["id"] for example in rest]}
-    textured = [example for example in rest if "patches" in example]
+    longest = max(len(example["mask"]) for example in small_arrays)
+    batch: Batch = {"ids": [example["id"] for example in small_arrays]}
+    textured = [example for example in small_arrays if "patches" in example]
     if textured:
         batch["patches"] = np.concatenate([example["patches"] for example in textured])
         batch["patch_index"] = np.full((count, longest), -1, np.int32)
         first = 0
-        for row, example in zip(batch["patch_index"], rest, strict=True):
+        for row, example in zip(batch["patch_index"], small_arrays, strict=True):
             if "patches" in example:
                 index = example["patch_index"]
                 row[: len(index)] = np.where(index >= 0, index + first, -1)
                 first += len(example["patches"])
-    shared = set.intersection(*(set(example) for example in rest)) - {"id", *PATCHES}
+    shared = set.intersection(*(set(example) for example in small_arrays)) - {"id", *PATCHES}
     for name in sorted(shared):
-        arrays = [example[name] for example in rest]
+        arrays = [example[name] for example in small_arrays]
         if name in pixels:
             batch[name] = pixels[name]
         elif name in TRIANGLES:

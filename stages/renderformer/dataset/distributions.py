@@ -70,7 +70,7 @@ def measure_scenes(draft: Any, rows: Iterable[Mapping[str, Any]]) -> dict[str, n
                 if noise := view.get("noise"):  # of views that were rendered twice
                     values["noise"].append([noise["sum"]["log_error"]])
                     values["noise psnr"].append([noise["sum"]["psnr"]])
-                    values["noise relit"].append([one["log_error"] for one in noise["reweighted"]])
+                    values["noise relit"].append([relit["log_error"] for relit in noise["reweighted"]])
         values["bytes"].append([len(members["scene.npz"])])
     return {name: np.concatenate(parts).astype(float) if parts else np.zeros(0) for name, parts in values.items()}
 

@@ -125,10 +125,10 @@ def sweep(table: str, names: Sequence[str] | None, overrides: Sequence[str], out
         at_once = ["jobs=1" if choose_device("auto", "") == "cuda" else f"jobs={min(len(jobs), os.cpu_count() or 1)}"]
     status = run_main([*words(table, order), *overrides, *at_once, "-m"])
     if split_config(next(iter(jobs.values())).root)[0].plan:
-        known_costs = [one for one in costs.values() if one]
+        known_costs = [estimate for estimate in costs.values() if estimate]
         print(
-            f"in all: {len(known_costs)} rows, {sum(one.flops for one in known_costs):.2e} FLOPs of training, "
-            f"{sum(one.days for one in known_costs):.3g} days of one A100"
+            f"in all: {len(known_costs)} rows, {sum(estimate.flops for estimate in known_costs):.2e} FLOPs of training, "
+            f"{sum(estimate.days for estimate in known_costs):.3g} days of one A100"
         )
         return status
     return status if status == INTERRUPTED else max(status, write_table(table, names, overrides, out))
@@ -317,9 +317,9 @@ def _pairs(ours: Mapping[str, Any], paper: Mapping[str, float], sign: str = "") 
     return cells
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
-    """A Markdown table whose first ``left`` columns are text."""
-    rule = "".join(" --- |" if place < left else " ---: |" for place in range(len(header)))
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int = 1) -> list[str]:
+    """A Markdown table whose first ``text_columns`` columns are text."""
+    rule = "".join(" --- |" if place < text_columns else " ---: |" for place in range(len(header)))
     return [f"| {' | '.join(header)} |", f"|{rule}", *(f"| {' | '.join(row)} |" for row in rows), ""]
 
 
@@ -351,7 +351,7 @@ def markdown(numbers: Mapping[str, Any]) -> str:
         for row in numbers["rows"]
         if "ours" in row
     ]  # fmt: skip
-    here = numbers["settings"]["here"]
+    our_settings = numbers["settings"]["here"]
     measured = any("lpips_vgg" in row.get("ours", {}) for row in numbers["rows"])
     lines = [
         f"# Table 1 of the paper: {numbers['table']}",
@@ -377,7 +377,9 @@ def markdown(numbers: Mapping[str, Any]) -> str:
         "## What differs from the paper",
         "",
         *_table(
-            ["", "paper", "here"], [[name, text, here[name]] for name, text in numbers["settings"]["paper"].items()], left=3
+            ["", "paper", "here"],
+            [[name, text, our_settings[name]] for name, text in numbers["settings"]["paper"].items()],
+            text_columns=3,
         ),
         "The authors later found a shader bug in the paper's training data and trained the released models anew, so that the "
         "paper's figures are not theirs either.",

@@ -128,8 +128,8 @@ def differences(runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
 def unlike(runs: Sequence[Run]) -> dict[str, list[str]]:
     """Settings in which the runs differ: ``stage.name`` -> a value per run."""
     flat = [dict(flatten(run.configs)) for run in runs]
-    names = dict.fromkeys(name for one in flat for name in one)
-    rows = {name: [one.get(name, "–") for one in flat] for name in names}
+    names = dict.fromkeys(name for facts in flat for name in facts)
+    rows = {name: [facts.get(name, "–") for facts in flat] for name in names}
     return {name: values for name, values in rows.items() if len(set(values)) > 1}
 
 

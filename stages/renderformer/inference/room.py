@@ -240,8 +240,8 @@ def _camera(template: str, points: np.ndarray) -> Camera:
     look_at = np.clip((points.min(axis=0) + points.max(axis=0)) / 2, *law.look_at)
     position = look_at + CAMERA_DISTANCE * direction
     camera = Camera(direction.tolist(), look_at.tolist(), CAMERA_DISTANCE, position.tolist(), [0.0, 0.0, 1.0], 0.0)
-    seen = (points - position) @ camera_to_world(camera)[:3, :3]
-    fov_deg = 2 * np.degrees(np.arctan(np.abs(seen[:, :2] / seen[:, 2:]).max() / FILLED))
+    in_camera = (points - position) @ camera_to_world(camera)[:3, :3]
+    fov_deg = 2 * np.degrees(np.arctan(np.abs(in_camera[:, :2] / in_camera[:, 2:]).max() / FILLED))
     return replace(camera, fov_deg=float(np.clip(fov_deg, *law.fov_deg)))
 
 
@@ -256,12 +256,13 @@ def _coloured(scene: SceneRecord, texture: TextureRecord, original: meshes.Mesh,
     from stages.renderformer.scenes.textures import nearest_colours, seen_faces
 
     vertices, faces = original
-    seen = None if len(faces) == len(mesh[1]) else seen_faces(vertices, faces)
+    visible = None if len(faces) == len(mesh[1]) else seen_faces(vertices, faces)
     row, column = np.nonzero(np.add.outer(np.arange(COLOUR_GRID), np.arange(COLOUR_GRID)) < COLOUR_GRID)
     first, second = (column + 1 / 3) / COLOUR_GRID, (row + 1 / 3) / COLOUR_GRID
     weights = np.stack([1 - first - second, first, second], axis=1)
     points = np.einsum("pk,fkc->fpc", weights, np.asarray(mesh[0], np.float64)[mesh[1]])
-    colours = nearest_colours(texture, vertices, faces, seen)(points.reshape(-1, 3)).reshape(*points.shape[:2], 3).mean(axis=1)
+    colour_at = nearest_colours(texture, vertices, faces, visible)
+    colours = colour_at(points.reshape(-1, 3)).reshape(*points.shape[:2], 3).mean(axis=1)
     diffuse = scene.diffuse.copy()
     diffuse[scene.object_index == len(TEMPLATES[scene.meta["template"]])] = (1 - SPECULAR) * np.clip(colours, 0, 1)
     return replace(scene, diffuse=diffuse)

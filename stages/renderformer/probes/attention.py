@@ -69,9 +69,9 @@ def choose_bundles(triangle: np.ndarray, object_index: np.ndarray, number: int, 
     triangle: (H, W) int32 seen by each pixel, -1 for nothing. object_index: (F,).
     """
     side = len(triangle) // patch
-    seen = np.where(triangle >= 0, object_index[triangle], -1)
-    tiles = seen.reshape(side, patch, side, patch).swapaxes(1, 2).reshape(side * side, -1)
-    names, pixels = np.unique(seen[seen >= 0], return_counts=True)
+    object_at_pixel = np.where(triangle >= 0, object_index[triangle], -1)
+    tiles = object_at_pixel.reshape(side, patch, side, patch).swapaxes(1, 2).reshape(side * side, -1)
+    names, pixels = np.unique(object_at_pixel[object_at_pixel >= 0], return_counts=True)
     places = np.stack(np.divmod(np.arange(side * side), side), axis=1)
     chosen: list[int] = []
     for name in names[np.argsort(-pixels, kind="stable")]:
@@ -81,8 +81,8 @@ def choose_bundles(triangle: np.ndarray, object_index: np.ndarray, number: int, 
         best = int(full[np.linalg.norm(places[full] - middle, axis=1).argmin()])
         if best not in chosen:
             chosen.append(best)
-    rest = np.argsort(-(tiles >= 0).mean(axis=1), kind="stable")
-    chosen += [int(tile) for tile in rest[:: max(1, len(rest) // (4 * number))] if int(tile) not in chosen]
+    fullest = np.argsort(-(tiles >= 0).mean(axis=1), kind="stable")
+    chosen += [int(tile) for tile in fullest[:: max(1, len(fullest) // (4 * number))] if int(tile) not in chosen]
     return chosen[:number]
 
 
@@ -181,7 +181,7 @@ class Attention(Probe):
             arrays = unpack_arrays(record.members["weights.npz"])
             target, prediction = (decode_rgb(record.members[f"{name}.exr"]) for name in ("reference", "prediction"))
             exposure = exposure_for(target)
-            seen = arrays["triangle"]
+            triangle_at_pixel = arrays["triangle"]
             for number, bundle in enumerate(fact["bundles"]):
                 row, column = divmod(bundle, config.resolution // patch)
                 bundle_rows = [entry for entry in fact["weights"] if entry["bundle"] == number]
@@ -193,11 +193,11 @@ class Attention(Probe):
                 scale = config.drawn_px / config.resolution
                 for place, layer in enumerate(layers):
                     weights = arrays["weights"][layer, number]
-                    top = float(weights[np.unique(seen[seen >= 0])].max(initial=1e-12))
+                    top = float(weights[np.unique(triangle_at_pixel[triangle_at_pixel >= 0])].max(initial=1e-12))
                     lights = 100 * next(entry["lights"] for entry in bundle_rows if entry["layer"] == layer)
-                    relative_weights = np.where(seen >= 0, weights[seen] / top, 0)
+                    relative_weights = np.where(triangle_at_pixel >= 0, weights[triangle_at_pixel] / top, 0)
                     pixels = colours(np.clip(relative_weights, 0, 1) ** 0.5, bytes=True)[..., :3].copy()
-                    pixels[seen < 0] = 255
+                    pixels[triangle_at_pixel < 0] = 255
                     axes = figure.add_subplot(grid[line, 2 + place])
                     show_picture(axes, pixels, f"layer {layer + 1}, top {100 * top:.2g} %\non lights {lights:.0f} %")
                     box = (column * patch * scale - 0.5, row * patch * scale - 0.5)

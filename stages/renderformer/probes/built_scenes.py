@@ -109,10 +109,10 @@ class Occluders(BuiltScenes):
         above = np.array([0.2 * np.cos(tilt), 0.2 * np.sin(tilt), 1.0])
         light = Light([0.0, 0.0, 0.866], [0.0, 0.0, 0.0], 2.4, (2.4 * above / np.linalg.norm(above)).tolist(),
                       [*DOWN, float(np.degrees(around))], [2.25] * 3, 3750.0)  # fmt: skip
-        seen = 1.8 * np.array([0.7 * np.cos(azimuth), 0.7 * np.sin(azimuth), 0.71])
+        camera_position = 1.8 * np.array([0.7 * np.cos(azimuth), 0.7 * np.sin(azimuth), 0.71])
         return (
             Plan("floor", "occluders", False, [floor], [in_place("plates", s, material(colours[1])) for s in solids],
-                 [light], [camera(seen, (0.0, 0.0, -0.25), 45.0)]),
+                 [light], [camera(camera_position, (0.0, 0.0, -0.25), 45.0)]),
             solids,
         )  # fmt: skip
 
@@ -152,11 +152,11 @@ class Bounces(BuiltScenes):
         vertices, faces = meshes.special(("torus", "cube", "cone", "cylinder")[rng.integers(4)], 3)
         centre = np.array([*rng.uniform(-0.12, 0.12, 2), -0.28])
         solid = (0.2 * vertices / np.abs(vertices).max() + centre, faces)
-        seen = np.array([rng.uniform(-0.35, 0.35), -1.75, rng.uniform(0.2, 0.6)])
+        camera_position = np.array([rng.uniform(-0.35, 0.35), -1.75, rng.uniform(0.2, 0.6)])
         lights = draw_lights(LightLaw(count=(1, 1)), rng, "box")
         return (
             Plan("box", "mirrors", False, walls, [in_place("object", solid, material(colours[4]))], lights,
-                 [camera(seen, (0.0, 0.0, -0.1), 40.0)]),
+                 [camera(camera_position, (0.0, 0.0, -0.1), 40.0)]),
             [solid],
         )  # fmt: skip
 

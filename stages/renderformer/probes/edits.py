@@ -65,9 +65,9 @@ def with_lights(scene: SceneRecord, triangles: np.ndarray, radiance: np.ndarray,
     """The scene lit by other lights: (N, 3, 3) triangles of (N, 3) radiance; ``number`` (N,): which light each belongs to."""
     solid = rows(scene, scene.light_index < 0)
     entries = [entry for entry in scene.meta["objects"] if entry["kind"] != "light"]
-    kept = [index for index, entry in enumerate(scene.meta["objects"]) if entry["kind"] != "light"]
+    solid_objects = [index for index, entry in enumerate(scene.meta["objects"]) if entry["kind"] != "light"]
     place_of = np.zeros(len(scene.meta["objects"]), np.int16)
-    place_of[kept] = np.arange(len(kept))
+    place_of[solid_objects] = np.arange(len(solid_objects))
     count = len(triangles)
     lights = {
         "triangles": triangles,
@@ -77,7 +77,7 @@ def with_lights(scene: SceneRecord, triangles: np.ndarray, radiance: np.ndarray,
         "roughness": np.ones(count),
         "emission": radiance,
         "light_index": number,
-        "object_index": len(kept) + np.asarray(number),
+        "object_index": len(solid_objects) + np.asarray(number),
     }
     arrays = {
         name: np.concatenate([place_of[solid.object_index] if name == "object_index" else getattr(solid, name), values])

@@ -308,8 +308,8 @@ class Sweep(Probe):
         )  # fmt: skip
         notes = [f"{len(complete_scenes)} {self.scope(config)}; 95 % intervals over scenes."]
         if len(complete_scenes) < len(all_scenes):
-            left = len(all_scenes) - len(complete_scenes)
-            notes.append(f"{left} scene(s) left out: dark, or the camera too close to something, at one of the values.")
+            left_out = len(all_scenes) - len(complete_scenes)
+            notes.append(f"{left_out} scene(s) left out: dark, or the camera too close to something, at one of the values.")
         errors = [row["error"] for row in rows if row["error"] is not None]
         if errors:
             spp = span([row["spp"] for row in rows])

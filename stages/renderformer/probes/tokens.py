@@ -209,22 +209,22 @@ def errors_of(predicted: np.ndarray, truth: np.ndarray, met: np.ndarray) -> tupl
     return tuple(float(x) for x in (np.abs(predicted - truth)[met].mean(), of_means, within))
 
 
-def draw_textures(scene: SceneRecord, seen: np.ndarray, faces: np.ndarray, textures: np.ndarray) -> np.ndarray:
+def draw_textures(scene: SceneRecord, triangle_at_pixel: np.ndarray, faces: np.ndarray, textures: np.ndarray) -> np.ndarray:
     """(H, W, 3) picture of the textures (T, P, P, 3) of triangles ``faces`` as the scene's first camera sees them.
 
-    seen: (H, W) the triangle of each pixel, -1 for nothing; black where a triangle shows its back or has no texture.
+    triangle_at_pixel: (H, W), -1 for nothing. The picture is black where a triangle shows its back or has no texture.
     """
     import torch
 
     from model.renderformer.network import ray_directions
 
-    side, size = len(seen), textures.shape[1]
+    side, size = len(triangle_at_pixel), textures.shape[1]
     pose = scene.camera_to_world[0].astype(np.float64)
     directions = ray_directions(torch.tensor(float(scene.fov_deg[0])), side, side).numpy().astype(np.float64) @ pose[:3, :3].T
     row_of = np.full(len(scene.triangles) + 1, -1)
     row_of[faces] = np.arange(len(faces))
-    y, x = np.nonzero((seen >= 0) & (row_of[seen] >= 0))
-    corners, ray = scene.triangles[seen[y, x]].astype(np.float64), directions[y, x]
+    y, x = np.nonzero((triangle_at_pixel >= 0) & (row_of[triangle_at_pixel] >= 0))
+    corners, ray = scene.triangles[triangle_at_pixel[y, x]].astype(np.float64), directions[y, x]
     # p + t d = a + u (b - a) + v (c - a), solved for (t, u, v)
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     front = np.einsum("ni,ni->n", np.cross(ab, ac), ray) < 0
@@ -234,7 +234,7 @@ def draw_textures(scene: SceneRecord, seen: np.ndarray, faces: np.ndarray, textu
     column, row = ((w * size).astype(int).clip(0, size - 1) for w in (u, v))
     over = np.maximum(row + column - size, 0)  # beside the triangle, where the pixel's sample met it and its centre does not
     out = np.zeros((side, side, 3), np.float32)
-    out[y, x] = textures[row_of[seen[y, x]], np.maximum(row - over, 0), column]
+    out[y, x] = textures[row_of[triangle_at_pixel[y, x]], np.maximum(row - over, 0), column]
     return out
 
 

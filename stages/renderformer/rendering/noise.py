@@ -63,10 +63,10 @@ def pair_error(a: ViewRecord, b: ViewRecord, rng: np.random.Generator) -> dict[s
 
 def noise_floor(pairs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Number of views, and the distributions of both errors over them, from what `pair_error` said of each."""
-    errors = {"sum": [pair["sum"] for pair in pairs], "reweighted": [one for pair in pairs for one in pair["reweighted"]]}
+    errors = {"sum": [pair["sum"] for pair in pairs], "reweighted": [error for pair in pairs for error in pair["reweighted"]]}
     distributions = {
-        name: {measure: _distribution([one[measure] for one in ones], digits) for measure, digits in DIGITS.items()}
-        for name, ones in errors.items()
+        name: {measure: _distribution([error[measure] for error in measured], digits) for measure, digits in DIGITS.items()}
+        for name, measured in errors.items()
     }
     return {"views": len(pairs), **distributions}
 

@@ -28,8 +28,8 @@ def texel_weights(size: int) -> tuple[np.ndarray, np.ndarray]:
     """
     row, column = np.indices((size, size))
     kept = row + column <= size
-    one, two = (column[kept] + 0.5) / size, (row[kept] + 0.5) / size
-    weights = np.maximum(np.stack([1 - one - two, one, two], axis=1), INSET)
+    along_first, along_second = (column[kept] + 0.5) / size, (row[kept] + 0.5) / size
+    weights = np.maximum(np.stack([1 - along_first - along_second, along_first, along_second], axis=1), INSET)
     return kept, weights / weights.sum(axis=1, keepdims=True)
 
 

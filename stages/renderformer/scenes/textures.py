@@ -116,10 +116,10 @@ def nearest_colours(
     """
     import igl
 
-    kept = np.arange(len(faces)) if seen is None or not seen.any() else np.flatnonzero(seen)
+    visible = np.arange(len(faces)) if seen is None or not seen.any() else np.flatnonzero(seen)
     vertices = np.ascontiguousarray(vertices, np.float64)
-    faces = np.ascontiguousarray(faces[kept], np.int64)
-    material, uv = texture.material[kept].astype(np.int64), texture.uv[kept].astype(np.float64)
+    faces = np.ascontiguousarray(faces[visible], np.int64)
+    material, uv = texture.material[visible].astype(np.int64), texture.uv[visible].astype(np.float64)
     corners = vertices[faces]
     tree = igl.AABB()
     tree.init(vertices, faces)
