@@ -158,6 +158,15 @@ def test_a_scene_is_traced_and_predicted_from_the_same_arrays(cube, checkpoint, 
     assert "resolution 24x24: the checkpoint was trained with 16x16" in result.table()  # what limits the prediction is told
 
 
+@pytest.mark.parametrize("choice", [{"view": "all"}, {"frames": 2}])
+def test_a_comparison_is_of_one_camera(cube, checkpoint, choice):
+    from stages.renderformer.inference.renderer import Renderer
+    from stages.renderformer.inference.settings import PredictSettings
+
+    with pytest.raises(UserError, match="of one camera"):
+        compare_scene(Renderer(checkpoint), cube, PredictSettings(**choice))
+
+
 def test_the_command_shows_a_scene_as_a_picture_and_a_table(cube, checkpoint, scalar, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["compare", str(cube), "--checkpoint", str(checkpoint), "--spp", "1", "--device", "cpu"]
