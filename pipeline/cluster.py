@@ -129,11 +129,11 @@ def _make_part(task: PartTask, code: str, guard: str) -> tuple[PartResult | User
     What a person must mend is returned, not raised, because Dask would try again. ``code`` is the digest of the runner's code
     of the stage, ``guard`` the name of the plugin that has the processes.
     """
-    here = socket.gethostname()
+    host = socket.gethostname()
     if not task.draft.is_dir():
-        return UserError(f"{here} sees no {task.draft}: executor=dask needs a store that all machines have under one path"), []
+        return UserError(f"{host} sees no {task.draft}: executor=dask needs a store that all machines have under one path"), []
     if _code(task.system, task.stage) != code:
-        return UserError(f"{here} has other code of {task.stage}: all machines need the same, then start the workers again"), []
+        return UserError(f"{host} has other code of {task.stage}: all machines need the same, then start the workers again"), []
     results: list[PartResult] = []
     lines: list[str] = []
     running_file(task.draft, task.part_key).unlink(missing_ok=True)  # of a lost worker, whose process numbers mean nothing here
@@ -142,7 +142,7 @@ def _make_part(task: PartTask, code: str, guard: str) -> tuple[PartResult | User
     except UserError as error:
         return error, lines
     except PoolBroken:  # raised, so that Dask tries again; this one can travel
-        raise _dying(here) from None
+        raise _dying(host) from None
     return results[0], lines
 
 

@@ -149,14 +149,14 @@ def _natural(name: str) -> list[tuple[bool, int, str]]:
     return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r"(\d+)", name)]
 
 
-def _lineage(store: Store, artifact: Artifact, indent: str, seen: set[str]) -> None:
+def _lineage(store: Store, artifact: Artifact, indent: str, printed_keys: set[str]) -> None:
     for name, key, parent in iter_inputs(store, artifact):
-        again = " (above)" if key in seen and parent is not None else ""
+        again = " (above)" if key in printed_keys and parent is not None else ""
         line = parent.name if parent is not None else f"{name}/{key[:12]} (gone)"
         print(f"{indent}{line}{again}")
         if parent is not None and not again:
-            seen.add(key)
-            _lineage(store, parent, indent + "  ", seen)
+            printed_keys.add(key)
+            _lineage(store, parent, indent + "  ", printed_keys)
 
 
 def command_why(store: Store, arguments: argparse.Namespace) -> int:
@@ -221,8 +221,8 @@ def _explain(
     preimage: Callable[[str], Mapping[str, Any] | None],
 ) -> None:
     lines = difference(old, new)
-    own = [line for line in lines if not line.startswith("inputs.")]
-    for line in own:
+    own_lines = [line for line in lines if not line.startswith("inputs.")]
+    for line in own_lines:
         print(f"{indent}{line}")
     for name in sorted(old["inputs"].keys() | new["inputs"].keys()):
         a, b = old["inputs"].get(name), new["inputs"].get(name)

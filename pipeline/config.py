@@ -70,13 +70,13 @@ class StageConfig(Section):
     max_reject_share: float = runtime(0.5, ge=0, le=1)  # above this share of rejected items the stage fails
 
 
-def nearest(word: str, known: Any) -> str:
+def nearest(word: str, choices: Any) -> str:
     """', did you mean X?' for the nearest known word, else the list of known ones."""
-    known = sorted(known)
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    choices = sorted(choices)
+    close = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
-    return f"; known are {', '.join(known)}" if known else ""
+    return f"; known are {', '.join(choices)}" if choices else ""
 
 
 def _fields(kind: Any, data: Any) -> set[str]:

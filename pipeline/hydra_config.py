@@ -121,10 +121,10 @@ def _explain(message: str, overrides: Sequence[str], system: System, more: Seque
                 good.append(word)
             except HydraException:
                 pass
-        known = OmegaConf.to_container(hydra_compose("config", overrides=[*good, *more]), resolve=False)
+        settings = OmegaConf.to_container(hydra_compose("config", overrides=[*good, *more]), resolve=False)
     except HydraException:
         return first
-    names = _leaves(known, "")
+    names = _leaves(settings, "")
     for word in overrides:
         name, equals, value = word.partition("=")
         bare = name.lstrip("+~")

@@ -94,12 +94,12 @@ def make_artifact(
 
 def _take(claim: Claim, run: Run, planned: Planned) -> None:
     """Wait for the claim, and say once who holds it."""
-    said = False
+    announced = False
     while not claim.take():
-        if not said and (holder := claim.holder()) is not None:
+        if not announced and (holder := claim.holder()) is not None:
             text = f"waiting: process {holder['pid']} on {holder['host']} is making {planned.key[:12]}"
             run.say(planned.name, text)
-            said = True
+            announced = True
         time.sleep(0.5)
 
 

@@ -119,14 +119,14 @@ def _list_work(making: Making, stage: MapStage) -> _Work:
     for part_key, (group, part_items, part_item_keys) in parts.items():
         marker = markers[part_key] or unfinished.get(part_key, {"items": [], "rejects": []})
         retried = {reject["item"] for reject in marker["rejects"] if limits.exceed(reject)}
-        kept = set(marker["items"]) - retried
-        if len(kept) == len(part_items) and markers[part_key] is not None:
+        finished_ids = set(marker["items"]) - retried
+        if len(finished_ids) == len(part_items) and markers[part_key] is not None:
             making.state.add_rejects(Counter(reject["reason"] for reject in marker["rejects"]))
             continue
         keyed_items = zip(part_items, part_item_keys, strict=True)
-        reuse = {item.id: reusable[key] for item, key in keyed_items if key in reusable and item.id not in kept}
+        reuse = {item.id: reusable[key] for item, key in keyed_items if key in reusable and item.id not in finished_ids}
         work.retried += len(retried)
-        work.missing[part_key] = len(part_items) - len(kept) - len(reuse)
+        work.missing[part_key] = len(part_items) - len(finished_ids) - len(reuse)
         work.tasks.append(
             PartTask(
                 making.run.settings.system, planned.name, planned.key, config, inputs, making.environment, draft.path,
@@ -209,7 +209,7 @@ def _reusable_items(making: Making, keys: Sequence[str]) -> dict[str, Reuse]:
     base = base_key(planned)
     reusable: dict[str, Reuse] = {}
     codes: dict[Path | None, list[str]] = {None: []}
-    wanted: set[str] = set()
+    wanted_keys: set[str] = set()
     for artifact in making.run.store.artifacts(planned.place):
         manifest = artifact.manifest
         if manifest["base_key"] != base or not planned.stage.same_environment(manifest["environment"], making.environment):
@@ -218,13 +218,13 @@ def _reusable_items(making: Making, keys: Sequence[str]) -> dict[str, Reuse]:
             artifact.rows(), artifact.rejects()
         except Damaged:  # it gives nothing, and is no input of ours
             continue
-        wanted = wanted or set(keys)
+        wanted_keys = wanted_keys or set(keys)
         codes[artifact.path] = artifact.codes
         for item_key, rows in itertools.groupby(artifact.rows(), key=lambda row: row.item_key):  # an item's rows are neighbours
-            if item_key in wanted:
+            if item_key in wanted_keys:
                 reusable[item_key] = Reuse(artifact.path, tuple(row.id for row in rows))
         for reject in artifact.rejects():
-            if reject.get("item_key") in wanted and not reject.get("machine"):
+            if reject.get("item_key") in wanted_keys and not reject.get("machine"):
                 reusable[reject["item_key"]] = Reuse(reject=reject)
     sources = {reuse.artifact for reuse in reusable.values()}
     making.draft.made_by(

@@ -43,10 +43,10 @@ def split_config(root: Mapping[str, Any]) -> tuple[RunConfig, System, dict[str, 
         engine["executor"] = parse(Executor, engine["executor"], "executor")
     run = parse(RunConfig, engine, "config")
     system = load_system(run.system)
-    known = {*RunConfig.model_fields, *system.modules, *system.groups}
+    names = {*RunConfig.model_fields, *system.modules, *system.groups}
     for name in root:
-        if name not in known:
-            raise UserError(f"{name} is unknown{nearest(name, known)}")
+        if name not in names:
+            raise UserError(f"{name} is unknown{nearest(name, names)}")
     stages = [stage for name in run.stage for stage in system.targets.get(name, (name,))]
     run = run.model_copy(update={"stage": tuple(dict.fromkeys(stages))})
     for name in (*run.stage, *run.force, *run.retry):
@@ -175,10 +175,10 @@ def item_keys(planned: Planned, items: Sequence[Item], inputs: Mapping[str, Arti
     """One key per item: the stage's identity, the item's id and source, the digests of the records that it needs."""
     base = base_key(planned)
     sources = planned.preimage["params"].get("identity", {}).get("items", {})
-    whole = {name: artifact.key for name, artifact in inputs.items()}
+    artifact_keys = {name: artifact.key for name, artifact in inputs.items()}
     keys = []
     for item in items:
-        needs: Any = whole
+        needs: Any = artifact_keys
         if item.needs is not None:
             needs = [[name, record, inputs[name].digest_of(record)] for name, record in item.needs]
         keys.append(digest_of_plain({"base": base, "item": item.id, "source": sources.get(item.id), "needs": needs}))

@@ -47,9 +47,9 @@ class Progress:
     def line(self) -> str:
         elapsed = time.monotonic() - self._start
         rate = (self.done - self.reused) / elapsed if elapsed > 0 else 0.0
-        left = duration((self.total - self.done) / rate) if rate > 0 else "?"
+        time_left = duration((self.total - self.done) / rate) if rate > 0 else "?"
         rejects = f", {self.rejects} rejected" if self.rejects else ""
-        return f"{self.label} {self.done}/{self.total}{rejects}, {rate:.2f}/s, {left} left"
+        return f"{self.label} {self.done}/{self.total}{rejects}, {rate:.2f}/s, {time_left} left"
 
     def add(self, done: int, rejects: int) -> None:
         self.done += done

@@ -61,15 +61,15 @@ def repair(store: Store, artifact: Artifact, workers: int | None = None, out: Ca
     def adopt(draft: Draft) -> None:
         if origin.get("environment") is not None:
             draft.set_environment(origin["environment"])
-        taken = 0
+        linked_parts = 0
         if isinstance(planned.stage, MapStage):
             draft.made_by(_codes(artifact), "what is sound was")
             for marker in sound_parts(artifact):
                 source = artifact.part_path(marker["digest"]) if marker["digest"] else artifact.path
-                taken += draft.link_part(source, marker["part_key"], marker)
+                linked_parts += draft.link_part(source, marker["part_key"], marker)
                 with contextlib.suppress(OSError):
                     shutil.copyfile(log_file(artifact.path, marker["part_key"]), log_file(draft.path, marker["part_key"]))
-            out(f"{name}: {taken} part(s) are sound and kept")
+            out(f"{name}: {linked_parts} part(s) are sound and kept")
         else:
             out(f"{name}: {planned.name} is one computation and has no parts: all of it is computed again")
 

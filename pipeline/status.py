@@ -122,11 +122,11 @@ def lines(state: Mapping[str, Any]) -> list[str]:
     if state.get("parts"):
         rate = (state["done"] - state["reused"]) / state["seconds"] if state["seconds"] else 0.0
         reused = f", {state['reused']} of them from before" if state["reused"] else ""
-        left = ""
+        time_left = ""
         if state["state"] == "running":
-            left = f", {duration((state['total'] - state['done']) / rate)} left" if rate else ", time left not known yet"
+            time_left = f", {duration((state['total'] - state['done']) / rate)} left" if rate else ", time left not known yet"
         add("parts", f"{state['parts_done']} of {state['parts']}")
-        add("items", f"{state['done']} of {state['total']}{reused}, {rate:.2f}/s{left}")
+        add("items", f"{state['done']} of {state['total']}{reused}, {rate:.2f}/s{time_left}")
     elif state["parts_done"]:
         add("parts", str(state["parts_done"]))
     if state.get("line"):

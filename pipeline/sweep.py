@@ -92,12 +92,12 @@ def describe(jobs: Sequence[Job]) -> str:
     """One line: what the jobs share, with the key of the last shared stage, and how many artifacts the others come to."""
     shared = shared_stages(jobs)
     names = list(dict.fromkeys(name for job in jobs for name in job.plan))
-    own = [f"{name} {len({job.keys.get(name) for job in jobs} - {None})}" for name in names if name not in shared]
+    unshared = [f"{name} {len({job.keys.get(name) for job in jobs} - {None})}" for name in names if name not in shared]
     text = f"sweep: {len(jobs)} jobs"
     if shared:
         last = list(shared)[-1]
         text += f" share {', '.join(shared)} ({last} {shared[last][:12]})"
-    return text + (f"; artifacts of their own: {', '.join(own)}" if own else "")
+    return text + (f"; artifacts of their own: {', '.join(unshared)}" if unshared else "")
 
 
 def label(job: Job, jobs: Sequence[Job]) -> str:
@@ -138,8 +138,8 @@ def run_side_by_side(jobs: Sequence[Job], at_once: int, command: Sequence[str], 
     width = max(len(name) for name in names.values())
     free: queue.SimpleQueue[Mapping[str, str]] = queue.SimpleQueue()  # one environment for each job that runs at a time
     for devices in deal(visible_gpus(), at_once):
-        own = {} if devices is None else {VISIBLE: ",".join(devices)}
-        free.put(os.environ | dict.fromkeys(THREAD_VARIABLES, str(cores)) | own)
+        gpu_environment = {} if devices is None else {VISIBLE: ",".join(devices)}
+        free.put(os.environ | dict.fromkeys(THREAD_VARIABLES, str(cores)) | gpu_environment)
 
     def run(job: Job) -> int:
         def say(text: str) -> None:
@@ -221,8 +221,8 @@ def _make_shared(job: Job, shared: Mapping[str, str], command: Sequence[str], ou
 
 def launcher_of(overrides: Sequence[str]) -> str | None:
     """The launcher that the overrides ask for."""
-    asked = [word.removeprefix(LAUNCHER) for word in overrides if word.startswith(LAUNCHER)]
-    return asked[-1] if asked else None
+    launchers = [word.removeprefix(LAUNCHER) for word in overrides if word.startswith(LAUNCHER)]
+    return launchers[-1] if launchers else None
 
 
 def run_by_launcher(

@@ -52,14 +52,14 @@ class Claim:
         except OSError:  # a file system without locks
             pass
         try:
-            other = json.loads(os.pread(handle, 4096, 0))
+            owner = json.loads(os.pread(handle, 4096, 0))
         except ValueError:
-            other = None if free else {"host": "?", "pid": 0}
-        if other is None or not free:
-            return other
-        if other["host"] == socket.gethostname():
-            return None if locked or not psutil.pid_exists(other["pid"]) or other["pid"] == os.getpid() else other
-        return other if abs(time.time() - os.fstat(handle).st_mtime) < STALE_CLAIM_S else None
+            owner = None if free else {"host": "?", "pid": 0}
+        if owner is None or not free:
+            return owner
+        if owner["host"] == socket.gethostname():
+            return None if locked or not psutil.pid_exists(owner["pid"]) or owner["pid"] == os.getpid() else owner
+        return owner if abs(time.time() - os.fstat(handle).st_mtime) < STALE_CLAIM_S else None
 
     def take(self) -> bool:
         """Take it unless another process holds it."""

@@ -169,16 +169,16 @@ class Draft(Records):
 
     def finish_part(self, part_key: str, marker: Mapping[str, Any]) -> None:
         """Say that the part is finished. What was kept of it while it was not goes."""
-        kept = self.marker(part_key, UNFINISHED)
+        unfinished_marker = self.marker(part_key, UNFINISHED)
         write_sealed(self.marker_path(part_key), marker)
         self.marker_path(part_key, UNFINISHED).unlink(missing_ok=True)
-        self._drop_tar(kept, marker)
+        self._drop_tar(unfinished_marker, marker)
 
     def keep_unfinished(self, part_key: str, marker: Mapping[str, Any]) -> None:
         """Keep the items that are done of a part of which an item failed, instead of what was kept before."""
-        kept = self.marker(part_key, UNFINISHED)
+        unfinished_marker = self.marker(part_key, UNFINISHED)
         write_sealed(self.marker_path(part_key, UNFINISHED), marker)
-        self._drop_tar(kept, marker)
+        self._drop_tar(unfinished_marker, marker)
 
     def _drop_tar(self, old: Mapping[str, Any] | None, new: Mapping[str, Any]) -> None:
         """Delete the tar of a marker that is replaced. If the new marker names the same one, it stays."""

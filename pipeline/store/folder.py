@@ -233,25 +233,25 @@ class Store:
         todo = [node.key for node in nodes if node.damaged or self.pinned(node.key) or self._used(node) >= horizon]
         for path in self.drafts():
             key = path.name.removesuffix(".partial")
-            held = key != claimed and self.claim(self.place_of(path), key).holder() is not None
-            if not held and not _changed_since(path, horizon):
+            claimed_by_another = key != claimed and self.claim(self.place_of(path), key).holder() is not None
+            if not claimed_by_another and not _changed_since(path, horizon):
                 garbage.append((path, f"unfinished and untouched for {days:g} days"))
             elif (draft := read_draft(path)) is not None:
                 todo += draft["preimage"]["inputs"].values()
             else:  # damaged, or not written yet: any artifact may be its input
                 todo += [node.key for node in nodes]
         inputs = {node.key: node.inputs for node in nodes}
-        needed: set[str] = set()
+        needed_keys: set[str] = set()
         while todo:
-            if (key := todo.pop()) not in needed:
-                needed.add(key)
+            if (key := todo.pop()) not in needed_keys:
+                needed_keys.add(key)
                 todo += inputs.get(key, ())
         for node in sorted(nodes, key=lambda node: node.committed, reverse=True):
-            if node.key not in needed:
+            if node.key not in needed_keys:
                 garbage.append((node.path, f"not pinned, not used for {days:g} days"))
             else:
-                left = [node.path / name for name in WORKING if (node.path / name).exists()]
-                garbage += [(path, "left over by a commit that was interrupted") for path in left]
+                leftovers = [node.path / name for name in WORKING if (node.path / name).exists()]
+                garbage += [(path, "left over by a commit that was interrupted") for path in leftovers]
         return garbage
 
     def remove(self, path: Path, days: float) -> bool:
