@@ -19,11 +19,11 @@ import numpy as np
 from pipeline.errors import UserError
 from stages.graphics.metrics import METRICS, Metric, flip_map, measure_all
 from stages.graphics.tonemap import exposure_for, exposure_text, from_picture, srgb_encode, to_picture
-from stages.renderformer.inference.renderer import PRETRAINED, Renderer
-from stages.renderformer.inference.settings import PredictSettings
 
 if TYPE_CHECKING:
+    from stages.renderformer.inference.renderer import Renderer
     from stages.renderformer.inference.room import Room
+    from stages.renderformer.inference.settings import PredictSettings
 
 IMAGES = (".exr", ".png")
 DIFFERENCE_GAIN = 5
@@ -140,6 +140,7 @@ def compare_scene(
 ) -> Comparison:
     """A comparison of one camera of a scene or mesh file: path traced with ``spp`` samples and denoised, and predicted."""
     from stages.graphics.mitsuba.backend import choose
+    from stages.renderformer.inference.renderer import PRETRAINED
     from stages.renderformer.rendering.render import render_views
     from stages.renderformer.rendering.settings import RenderSettings
 
