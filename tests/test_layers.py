@@ -51,6 +51,7 @@ stages.graphics
 model.renderformer  model.neuras
 model.training
 model.lpips  model.timing
+model.weights
 model.errors
 model
 pipeline.__main__  pipeline.job  pipeline.commands

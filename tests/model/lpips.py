@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from model.lpips import LPIPS, NETWORKS
+from model.lpips import LPIPS, NETWORKS, Features
 
 # torchvision's networks: convolutions by number, as (stride, padding), after which the features are compared; "pool" between
 WRITTEN_OUT = {
@@ -24,24 +24,24 @@ def write_weights(folder: Path, network: str) -> None:
     """Random weights in the layout of the published files."""
     torch.manual_seed(1)
     spec = NETWORKS[network]
-    metric = LPIPS(network)
+    metric = LPIPS(Features(network))
     features = {"classifier.0.weight": torch.zeros(1)}
     number = 0
-    for layer, stage in zip(spec["layers"], metric.stages, strict=True):
+    for layer, stage in zip(spec["layers"], metric.features.stages, strict=True):
         if len(layer) == 4:
             features[f"features.{number}.weight"] = torch.randn_like(stage.weight) / math.sqrt(stage.weight[0].numel())
             features[f"features.{number}.bias"] = torch.randn_like(stage.bias) * 0.1
         number += 2 if len(layer) == 4 else 1  # a ReLU follows each convolution
-    torch.save(features, folder / spec["features"][0])
     linear = {f"lin{i}.model.1.weight": torch.rand_like(parameter) for i, parameter in enumerate(metric.linear)}
-    torch.save(linear, folder / spec["linear"][0])
+    for tensors, file in zip((features, linear), spec["files"], strict=True):
+        torch.save(tensors, folder / file.name)
 
 
 def distance(folder: Path, network: str, a: np.ndarray, b: np.ndarray) -> float:
     """Between (3, H, W) images in [0, 1], by the weight files in ``folder``; convolutions are sums over shifted images."""
     features, linear = (
-        {key: value.double().numpy() for key, value in torch.load(folder / spec[0], weights_only=True).items()}
-        for spec in (NETWORKS[network]["features"], NETWORKS[network]["linear"])
+        {key: value.double().numpy() for key, value in torch.load(folder / file.name, weights_only=True).items()}
+        for file in NETWORKS[network]["files"]
     )
     layers, geometry, compared, pool_size = WRITTEN_OUT[network]
 

@@ -81,12 +81,14 @@ def test_lpips_gradient_is_finite_also_on_black(tmp_path):
         assert y.grad.isfinite().all() and y.grad.abs().sum() > 0
 
 
-def test_missing_lpips_weights_say_where_to_get_them(tmp_path):
+def test_missing_lpips_weights_say_where_to_get_them(tmp_path, monkeypatch):
+    monkeypatch.delenv("LIGHTMILL_LPIPS", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     with pytest.raises(ValueError, match=r"vgg16-397923af.pth.*https://.*lpips=0"):
         LPIPS.load(tmp_path)
-    with pytest.raises(ValueError, match="lpips_folder"):
+    with pytest.raises(ValueError, match="cache.*lightmill weights lpips.*lpips_folder"):
         LPIPS.load(None)
     write_weights(tmp_path, "vgg")
     torch.save({"lin0": torch.zeros(1)}, tmp_path / "vgg.pth")
-    with pytest.raises(ValueError, match="do not hold"):
+    with pytest.raises(ValueError, match="does not hold"):
         LPIPS.load(tmp_path)
