@@ -91,14 +91,18 @@ class LPIPS(nn.Module):
         self.linear = nn.ParameterList(nn.Parameter(torch.zeros(1, count, 1, 1)) for count in features.channels)
         self.requires_grad_(False).eval()
 
-    @classmethod
-    def load(cls, folder: Path | None, network: str = "vgg") -> LPIPS:
-        """From the two published files in ``folder``, or else where `lightmill weights lpips` puts them.
+    @staticmethod
+    def files(folder: Path | str | None, network: str = "vgg") -> list[Path]:
+        """The two published files in ``folder``, or else where `lightmill weights lpips` puts them.
 
         A missing file is an error that says how to get it.
         """
         without = "train.lpips=0, evaluate.lpips=none"
-        features, heads = (LPIPS_SET.find(file, folder, "LPIPS", without) for file in NETWORKS[network]["files"])
+        return [LPIPS_SET.find(file, folder, "LPIPS", without) for file in NETWORKS[network]["files"]]
+
+    @classmethod
+    def load(cls, folder: Path | str | None, network: str = "vgg") -> LPIPS:
+        features, heads = cls.files(folder, network)
         metric = cls(Features.load(features, network))
         tensors = read(heads)
         try:

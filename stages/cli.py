@@ -34,14 +34,17 @@ def command_run(arguments: argparse.Namespace) -> int:
 
 
 def command_weights(arguments: argparse.Namespace) -> int:
+    from model.inception import Inception
     from model.lpips import LPIPS, NETWORKS
-    from model.weights import LPIPS_SET, fetch
+    from model.weights import fetch
 
     chosen = SETS[arguments.set]
     folder = fetch(chosen, arguments.folder)
-    if chosen is LPIPS_SET:
+    if chosen.name == "inception":  # names and shapes are those of our networks, too
+        Inception.load(folder)
+    else:
         for network in NETWORKS:
-            LPIPS.load(folder, network)  # their names and shapes are those of our networks, too
+            LPIPS.load(folder, network)
     elsewhere = folder != chosen.folder()
     hint = f"; {chosen.variable}={folder} or the setting {chosen.name}_folder names it" if elsewhere else ""
     print(f"{folder}: complete{hint}")
@@ -64,7 +67,11 @@ def build_parser() -> argparse.ArgumentParser:
     summary = "download the published weights that a metric or a loss needs, and check them"
     sub = parsers.add_parser("weights", help=summary, description=summary, epilog=f"example: {PROGRAM} weights lpips")
     sub.set_defaults(function=command_weights)
-    sub.add_argument("set", choices=sorted(SETS), help="lpips: VGG16, AlexNet and LPIPS' linear layers (800 MB)")
+    sub.add_argument(
+        "set",
+        choices=sorted(SETS),
+        help="lpips: VGG16, AlexNet, LPIPS' linear layers (800 MB); inception: FID's network (96 MB)",
+    )
     sub.add_argument("--folder", metavar="DIR", help="where to (default: the user's cache, where all stages look)")
     add_commands(parsers, PROGRAM)
     for system in systems():

@@ -50,7 +50,7 @@ stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages
 stages.graphics
 model.renderformer  model.neuras
 model.training
-model.lpips  model.timing
+model.lpips  model.inception  model.timing
 model.weights
 model.errors
 model
