@@ -138,6 +138,15 @@ def test_the_command_fetches_what_lpips_then_finds_by_itself(server, tmp_path, m
     assert "LIGHTMILL_LPIPS" in capsys.readouterr().out
 
 
+def test_the_command_looks_into_the_file_of_inception(server, monkeypatch, capsys):
+    """The tensors of another network, whose digest is as expected."""
+    name = weights.INCEPTION_2015.name
+    chosen = WeightSet("inception", "LIGHTMILL_INCEPTION", (served(server, name, tensors(1)),))
+    monkeypatch.setitem(SETS, "inception", chosen)
+    assert cli.main(["weights", "inception"]) == 2
+    assert "does not hold the Inception network of FID" in capsys.readouterr().err
+
+
 def test_the_command_says_what_to_do_without_a_network(monkeypatch, capsys):
     """Nothing listens on that port."""
     files = tuple(WeightFile(file.name, f"http://127.0.0.1:9/{file.name}", file.sha256) for file in LPIPS_SET.files)
