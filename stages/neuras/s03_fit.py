@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from pipeline.config import StageConfig, runtime
+from pipeline.config import StageConfig, added, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, RunStage
 from stages.graphics.device import choose_device
@@ -57,7 +57,7 @@ class FitStageConfig(StageConfig):
     commitment: float = Field(0.25, ge=0)  # beta
     quantize_from: float = Field(0.0, ge=0, le=1)  # share of the steps before quantization begins
     perceptual: float = Field(0.0, ge=0)  # lambda_perc
-    perceptual_network: Literal["gradients", "vgg"] = "gradients"  # what it compares: neighbouring pixels, or VGG16's layers
+    perceptual_network: Literal["gradients", "vgg"] = added("gradients", legacy="gradients")  # what it compares
     shared_levels: int = Field(2, ge=0, le=4)  # coarse levels that near texels share
     voxel_m: float = Field(0.3, gt=0)  # edge of the finest cell of the mesh; each coarser one is four times as wide
     block: int = Field(4, ge=2)  # texels along the finest cell of a skybox
