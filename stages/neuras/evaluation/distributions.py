@@ -1,8 +1,8 @@
 """How far a set of pictures looks from a set of photos: FID and KID, of features of the Inception network.
 
 Neither needs the photo of the same place. So the paper judges lanes beside the drive by them, against the photos of the drive.
-Truth beside the drive, where it exists, is judged the same way: it says what a good value is. Warping can come closer, because it
-shows the photos themselves. FID is biased upwards where images are few, so compare only sets of the same size. KID is not.
+Truth beside the drive, where it exists, is judged the same way: it says what a good value is. Warping can come closer, because
+it shows the photos themselves. FID is biased upwards where images are few, so compare only sets of the same size. KID is not.
 Masks are not applied.
 """
 
