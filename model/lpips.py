@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import torch
@@ -10,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model.errors import InputError
+from model.weights import ALEX_HEADS, ALEXNET, LPIPS_SET, VGG16, VGG_HEADS, read
 
 VGG16_POOL, ALEX_POOL = (2, 2), (3, 2)
 NETWORKS = {
@@ -17,32 +17,29 @@ NETWORKS = {
         "layers": [
             *[(64, 3, 1, 1)] * 2, VGG16_POOL, *[(128, 3, 1, 1)] * 2, VGG16_POOL, *[(256, 3, 1, 1)] * 3, VGG16_POOL,
             *[(512, 3, 1, 1)] * 3, VGG16_POOL, *[(512, 3, 1, 1)] * 3,
-        ],  # fmt: skip
+        ],
         "compared": (1, 4, 8, 12, 16),
-        "features": ("vgg16-397923af.pth", "https://download.pytorch.org/models/vgg16-397923af.pth"),
-        "linear": ("vgg.pth", "https://github.com/richzhang/PerceptualSimilarity/raw/master/lpips/weights/v0.1/vgg.pth"),
+        "files": (VGG16, VGG_HEADS),
     },
     "alex": {
         "layers": [
             (64, 11, 4, 2), ALEX_POOL, (192, 5, 1, 2), ALEX_POOL, (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1),
-        ],  # fmt: skip
+        ],
         "compared": (0, 2, 4, 5, 6),
-        "features": ("alexnet-owt-7be5be79.pth", "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"),
-        "linear": ("alex.pth", "https://github.com/richzhang/PerceptualSimilarity/raw/master/lpips/weights/v0.1/alex.pth"),
+        "files": (ALEXNET, ALEX_HEADS),
     },
 }  # fmt: skip
-FOLDER_VARIABLE = "LIGHTMILL_LPIPS"  # where the weight files lie, if the config does not say
 
 
-class LPIPS(nn.Module):
-    """Learned perceptual distance between images in [0, 1]; frozen, but it passes gradients on to the images."""
+class Features(nn.Module):
+    """The convolutions of a published network: what it sees in images in [0, 1]. Frozen, but it passes gradients on to them."""
 
     def __init__(self, network: str = "vgg"):
         super().__init__()
         spec = NETWORKS[network]
         self.compared = spec["compared"]
         self.stages = nn.ModuleList()
-        self.linear = nn.ParameterList()
+        self.channels: list[int] = []  # of each compared layer
         channels = 3
         for index, layer in enumerate(spec["layers"]):
             if len(layer) == 2:
@@ -51,45 +48,29 @@ class LPIPS(nn.Module):
                 self.stages.append(nn.Conv2d(channels, layer[0], layer[1], layer[2], layer[3]))
                 channels = layer[0]
             if index in self.compared:
-                self.linear.append(nn.Parameter(torch.zeros(1, channels, 1, 1)))
+                self.channels.append(channels)
         # ImageNet statistics, in the [-1, 1] range that the published linear layers were fitted with.
         self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1))
         self.requires_grad_(False).eval()
 
     @classmethod
-    def load(cls, folder: Path | None, network: str = "vgg") -> LPIPS:
-        """From the two published files in ``folder``, or else in the one that LIGHTMILL_LPIPS names.
-
-        A missing file is an error that says where to get it.
-        """
-        spec = NETWORKS[network]
-        if folder is None and os.environ.get(FOLDER_VARIABLE):
-            folder = Path(os.environ[FOLDER_VARIABLE]).expanduser()
-        loaded = []
-        for name, url in (spec["features"], spec["linear"]):
-            path = None if folder is None else Path(folder) / name
-            if path is None or not path.is_file():
-                where = f"no folder is named (lpips_folder, or {FOLDER_VARIABLE})" if path is None else f"{path} does not exist"
-                without = "go without: train.lpips=0, evaluate.lpips=none"
-                raise InputError(f"LPIPS needs {name}, but {where}: get it from {url}, or {without}")
-            loaded.append(torch.load(path, map_location="cpu", weights_only=True))
-        features, linear = loaded
-        metric = cls(network)
-        convolutions = [stage for stage in metric.stages if isinstance(stage, nn.Conv2d)]
-        numbers = sorted({int(key.split(".")[1]) for key in features if key.startswith("features.")})
+    def load(cls, path: Path, network: str = "vgg") -> Features:
+        """From torchvision's file; what follows the convolutions in it is left out."""
+        tensors = read(path)
+        features = cls(network)
+        convolutions = [stage for stage in features.stages if isinstance(stage, nn.Conv2d)]
         try:
+            numbers = sorted({int(key.split(".")[1]) for key in tensors if key.startswith("features.")})
             for number, stage in zip(numbers, convolutions, strict=True):
-                stage.weight.data.copy_(features[f"features.{number}.weight"])
-                stage.bias.data.copy_(features[f"features.{number}.bias"])
-            for index, parameter in enumerate(metric.linear):
-                parameter.data.copy_(linear[f"lin{index}.model.1.weight"])
+                stage.weight.data.copy_(tensors[f"features.{number}.weight"])
+                stage.bias.data.copy_(tensors[f"features.{number}.bias"])
         except (KeyError, RuntimeError, ValueError) as error:
-            names = f"{spec['features'][0]} and {spec['linear'][0]}"
-            raise InputError(f"{folder}: {names} do not hold the published LPIPS weights: {error}") from None
-        return metric
+            raise InputError(f"{path} does not hold the weights of {network}: {error}") from None
+        return features
 
-    def _features(self, image: Tensor) -> list[Tensor]:
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """(B, 3, H, W) -> (B, C, h, w) of each compared layer, after its ReLU."""
         x = (2 * image - 1 - self.shift) / self.scale
         features = []
         for index, stage in enumerate(self.stages):
@@ -97,13 +78,47 @@ class LPIPS(nn.Module):
             if isinstance(stage, nn.Conv2d):
                 x = F.relu(x)
             if index in self.compared:
-                # The tiny number under the root keeps its gradient finite where all features are 0.
-                features.append(x / (x.square().sum(dim=1, keepdim=True).add(1e-20).sqrt() + 1e-10))
+                features.append(x)
         return features
+
+
+class LPIPS(nn.Module):
+    """Learned perceptual distance between images in [0, 1]; frozen, but it passes gradients on to the images."""
+
+    def __init__(self, features: Features):
+        super().__init__()
+        self.features = features
+        self.linear = nn.ParameterList(nn.Parameter(torch.zeros(1, count, 1, 1)) for count in features.channels)
+        self.requires_grad_(False).eval()
+
+    @staticmethod
+    def files(folder: Path | str | None, network: str = "vgg") -> list[Path]:
+        """The two published files in ``folder``, or else where `lightmill weights lpips` puts them.
+
+        A missing file is an error that says how to get it.
+        """
+        without = "train.lpips=0, evaluate.lpips=none"
+        return [LPIPS_SET.find(file, folder, "LPIPS", without) for file in NETWORKS[network]["files"]]
+
+    @classmethod
+    def load(cls, folder: Path | str | None, network: str = "vgg") -> LPIPS:
+        features, heads = cls.files(folder, network)
+        metric = cls(Features.load(features, network))
+        tensors = read(heads)
+        try:
+            for index, parameter in enumerate(metric.linear):
+                parameter.data.copy_(tensors[f"lin{index}.model.1.weight"])
+        except (KeyError, RuntimeError) as error:
+            raise InputError(f"{heads} does not hold the linear layers of LPIPS: {error}") from None
+        return metric
+
+    def _directions(self, image: Tensor) -> list[Tensor]:
+        """The features, each pixel's of length 1. The tiny number under the root keeps its gradient finite where all are 0."""
+        return [x / (x.square().sum(dim=1, keepdim=True).add(1e-20).sqrt() + 1e-10) for x in self.features(image)]
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """(B, 3, H, W) in [0, 1] each -> (B,) distances."""
         total = a.new_zeros(a.shape[0])
-        for x, y, weight in zip(self._features(a), self._features(b), self.linear, strict=True):
+        for x, y, weight in zip(self._directions(a), self._directions(b), self.linear, strict=True):
             total = total + ((x - y).square() * weight).sum(dim=1).mean(dim=(1, 2))
         return total

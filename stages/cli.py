@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 
 import stages
+from model.weights import SETS
 from pipeline.commands import add_commands
 from pipeline.errors import INTERRUPTED, UserError, for_people, status_of
 from pipeline.stage import System
@@ -32,6 +33,24 @@ def command_run(arguments: argparse.Namespace) -> int:
     return run_main([*arguments.words, *(["--debug"] if arguments.debug else [])])
 
 
+def command_weights(arguments: argparse.Namespace) -> int:
+    from model.inception import Inception
+    from model.lpips import LPIPS, NETWORKS
+    from model.weights import fetch
+
+    chosen = SETS[arguments.set]
+    folder = fetch(chosen, arguments.folder)
+    if chosen.name == "inception":  # names and shapes are those of our networks, too
+        Inception.load(folder)
+    else:
+        for network in NETWORKS:
+            LPIPS.load(folder, network)
+    elsewhere = folder != chosen.folder()
+    hint = f"; {chosen.variable}={folder} or the setting {chosen.name}_folder names it" if elsewhere else ""
+    print(f"{folder}: complete{hint}")
+    return 0
+
+
 def build_parser() -> argparse.ArgumentParser:
     debug = argparse.ArgumentParser(add_help=False)
     debug.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -45,6 +64,15 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.set_defaults(function=command_run, takes_words=True)
     sub.usage = f"{PROGRAM} run [system=NAME] [stage=STAGE] [name=value ...] [-m] [--debug]"
+    summary = "download the published weights that a metric or a loss needs, and check them"
+    sub = parsers.add_parser("weights", help=summary, description=summary, epilog=f"example: {PROGRAM} weights lpips")
+    sub.set_defaults(function=command_weights)
+    sub.add_argument(
+        "set",
+        choices=sorted(SETS),
+        help="lpips: VGG16, AlexNet, LPIPS' linear layers (800 MB); inception: FID's network (96 MB)",
+    )
+    sub.add_argument("--folder", metavar="DIR", help="where to (default: the user's cache, where all stages look)")
     add_commands(parsers, PROGRAM)
     for system in systems():
         if system.commands:

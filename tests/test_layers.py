@@ -50,7 +50,8 @@ stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages
 stages.graphics
 model.renderformer  model.neuras
 model.training
-model.lpips  model.timing
+model.lpips  model.inception  model.timing
+model.weights
 model.errors
 model
 pipeline.__main__  pipeline.job  pipeline.commands

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from model.errors import InputError
 from model.neuras.baked import Baked
+from model.neuras.losses import perceptual_loss
 from model.neuras.quantization import straight_through
 from model.neuras.rays import Batch, Pixels, View
 from model.neuras.sampling import gather
@@ -48,6 +49,7 @@ class Trainer:
         if scene.codes:
             groups.append({"params": list(scene.codes.values()), "lr": scene.config.lr})
         self.optimizer = torch.optim.Adam([group | {"peak_lr": group["lr"]} for group in groups], betas=(0.9, 0.99))
+        self.perceptual = perceptual_loss(self.config.perceptual_network, self.config.lpips_folder, scene.device)
         self.window = torch.zeros(len(LOSSES) + 1, dtype=torch.float64)
         if scene.config.compile:
             scene.mesh_shader.compile()
@@ -77,7 +79,9 @@ class Trainer:
             rendered = scene.shade(batch, samples, directions)
         difference = (rendered - batch.rgb) * batch.counts[:, None]
         photometric = difference.square().mean()
-        perceptual = gradient_loss(difference, batch.patch) if config.perceptual else torch.zeros_like(photometric)
+        perceptual = torch.zeros_like(photometric)
+        if config.perceptual:
+            perceptual = self.perceptual(difference, batch.rgb * batch.counts[:, None], batch.patch)
         total = photometric + config.perceptual * perceptual + config.vq * vq
         losses = torch.stack([loss.detach() for loss in (total, photometric, perceptual, vq)]).double().cpu()
         if not torch.isfinite(losses).all():
@@ -133,21 +137,6 @@ class Trainer:
                 value.copy_(saved.get_tensor(name))
             self.step = int(saved.get_tensor("step"))
         return True
-
-
-def gradient_loss(difference: Tensor, patch: int) -> Tensor:
-    """A stand-in for VGG that needs no weights: L1 between the differences of neighbouring pixels, at three scales.
-
-    ``difference``: (B, 3) prediction less truth, patch after patch.
-    """
-    image = difference.view(-1, patch, patch, 3).permute(0, 3, 1, 2)
-    total = image.new_zeros(())
-    for _ in range(3):
-        total = total + (image[:, :, 1:] - image[:, :, :-1]).abs().mean() + (image[..., 1:] - image[..., :-1]).abs().mean()
-        if min(image.shape[2:]) < 4:
-            break
-        image = torch.nn.functional.avg_pool2d(image, 2)
-    return total
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from model.neuras import shading, skyboxes
 from model.neuras.baked import Baked
+from model.neuras.losses import PerceptualNetwork
 from model.neuras.maps import Maps, blocks, voxels
 from model.neuras.quantization import clusters, nearest
 from model.neuras.rays import Batch, Pixels
@@ -44,6 +45,7 @@ class FitConfig:
     vq: float = 0.1  # lambda_vq
     commitment: float = 0.25  # beta
     perceptual: float = 0.0  # lambda_perc
+    perceptual_network: PerceptualNetwork = "gradients"
     shared_levels: int = 2  # coarse levels
     voxel: float = 0.3  # edge of the finest voxel that texels of the mesh share
     block: int = 4  # texels along the finest block that texels of a skybox share
@@ -56,8 +58,9 @@ class FitConfig:
     log_every: int = 20
     validate_every: int = 0  # steps; 0: at the end alone
     checkpoint_every: int = 50
+    lpips_folder: str | None = None  # of VGG16's weights; None: see model.weights
 
-    RUNTIME = ("compile", "mixed_precision", "log_every", "validate_every", "checkpoint_every")
+    RUNTIME = ("lpips_folder", "compile", "mixed_precision", "log_every", "validate_every", "checkpoint_every")
 
     def identity(self) -> dict[str, Any]:
         return {name: value for name, value in dataclasses.asdict(self).items() if name not in self.RUNTIME}

@@ -1,7 +1,7 @@
 """The training loss: L1 on log10(1 + radiance), plus LPIPS on the tone-mapped image (section 3.3).
 
-LPIPS (Zhang et al. 2018) is built here from two published weight files, so that torchvision need not be installed:
-torchvision's ImageNet network and the metric's linear layers. A weight of 0 never looks for either.
+LPIPS (Zhang et al. 2018) comes from two published weight files (``model.lpips``): torchvision's ImageNet network and the
+metric's linear layers. A weight of 0 never looks for either.
 """
 
 from __future__ import annotations

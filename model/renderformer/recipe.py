@@ -40,7 +40,7 @@ class FitConfig(BaseModel):
     # Share of the gradient that pixels below 0 get besides ELU's own 1e-3: at high learning rates the output else dies
     gradient_leak: float = Field(0.1, ge=0, le=1)
     # Runtime
-    lpips_folder: str | None = _runtime(None)  # folder with the published LPIPS weights; None: LIGHTMILL_LPIPS
+    lpips_folder: str | None = _runtime(None)  # folder with the published LPIPS weights; None: see model.weights
     micro_scenes: int | None = _runtime(None, ge=1)  # scenes of a process in memory at once, gradients add up; None: all
     activation_checkpointing: bool = _runtime(False)  # compute activations again instead of keeping them
     parallel: Literal["ddp", "fsdp"] = _runtime("ddp")  # under torchrun: whole models, or one split over the processes

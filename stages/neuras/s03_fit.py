@@ -8,13 +8,13 @@ sees of the mesh is cast anew in a run that goes on: 0.05 CPU-s a frame. The loo
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from pipeline.config import StageConfig, runtime
+from pipeline.config import StageConfig, added, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, RunStage
 from stages.graphics.device import choose_device
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pipeline.store import Draft
     from stages.neuras.records import AtlasMesh, CaptureInfo, FrameRecord
 
+VGG_LEAST = 16  # pixels along a patch: VGG16 halves it four times
 REACH = 3.0  # texels around a chart that a bilinear sample may read
 
 
@@ -55,7 +56,8 @@ class FitStageConfig(StageConfig):
     vq: float = Field(0.1, ge=0)  # lambda_vq
     commitment: float = Field(0.25, ge=0)  # beta
     quantize_from: float = Field(0.0, ge=0, le=1)  # share of the steps before quantization begins
-    perceptual: float = Field(0.0, ge=0)  # lambda_perc, of differences between neighbouring pixels
+    perceptual: float = Field(0.0, ge=0)  # lambda_perc
+    perceptual_network: Literal["gradients", "vgg"] = added("gradients", legacy="gradients")  # what it compares
     shared_levels: int = Field(2, ge=0, le=4)  # coarse levels that near texels share
     voxel_m: float = Field(0.3, gt=0)  # edge of the finest cell of the mesh; each coarser one is four times as wide
     block: int = Field(4, ge=2)  # texels along the finest cell of a skybox
@@ -71,6 +73,7 @@ class FitStageConfig(StageConfig):
     checkpoint_every: int = runtime(100, ge=1)
     pictures: int = runtime(6, ge=0)  # validation views shown
     tensorboard: bool = runtime(True)  # events besides the curve
+    lpips_folder: str | None = runtime(None)  # where VGG16's weights lie; None: see model.weights
 
     @model_validator(mode="after")
     def _consistent(self) -> FitStageConfig:
@@ -78,6 +81,15 @@ class FitStageConfig(StageConfig):
             raise ValueError("layers=1 leaves no layer before the opacity: 0 for no network, or at least 2")
         if self.sky_far_m < self.sky_near_m:
             raise ValueError(f"sky_far_m={self.sky_far_m:g} is less than sky_near_m={self.sky_near_m:g}")
+        if self.perceptual_network == "vgg":
+            if not self.perceptual:
+                raise ValueError(
+                    "perceptual_network=vgg does nothing with perceptual=0: give it a weight, such as perceptual=0.001"
+                )
+            if self.patch < VGG_LEAST:
+                raise ValueError(
+                    f"patch={self.patch} is too small for VGG16, which needs {VGG_LEAST} pixels: better patch=32 patches=8"
+                )
         return self
 
     def fit(self, metre: float) -> FitConfig:
@@ -101,6 +113,12 @@ class Fit(RunStage):
     def slug(self, config: FitStageConfig) -> str:
         parts = ["plain" if not config.layers else "" if config.view_direction else "fixed", "" if config.codes else "novq"]
         return "-".join(part for part in parts if part) or f"{config.steps}"
+
+    def identity(self, config: FitStageConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
+        """VGG16's weights, where the loss reads them."""
+        from model.neuras.losses import vgg_file
+
+        return {"vgg16": hash_file(vgg_file(config.lpips_folder))} if config.perceptual_network == "vgg" else {}
 
     def run(self, config: FitStageConfig, inputs: Inputs, draft: Draft) -> list[str]:
         import torch

@@ -8,7 +8,7 @@ stay out of the records and of metrics.json.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
@@ -31,7 +31,10 @@ class EvaluateConfig(StageConfig):
     warping_views: int = Field(4, ge=1)  # nearest photos that warping takes for a view
     depth_tolerance: float = Field(0.05, gt=0)  # of the mesh, relative to the true depth
     lpips: Literal["none", "vgg", "alex"] = "none"
-    lpips_folder: str | None = runtime(None)  # where its weights lie
+    lpips_folder: str | None = runtime(None)  # where its weights lie; None: see model.weights
+    inception: bool = report(False)  # FID and KID beside the drive
+    inception_folder: str | None = runtime(None)  # where its weights lie
+    shifts_m: tuple[float, ...] = report((2.0, 3.0))  # of FID and KID where the capture has no frames beside the drive
     gallery: int = report(15, ge=0)  # views shown in the report
     video_frames: int = report(72, ge=0)  # of each video, 0: none
     timing_frames: int = report(3, ge=0)  # frames timed, 0: none
@@ -46,6 +49,16 @@ class Evaluate(MapStage):
     Config: ClassVar[Any] = EvaluateConfig
     headline: ClassVar[str | None] = "report.html"
     reasons: ClassVar[dict[str, str]] = {"masked": "its mask leaves almost no pixel to compare"}
+
+    def agree(self, config: EvaluateConfig, configs: Mapping[str, StageConfig]) -> None:
+        """Weights that are missing are missed before anything runs."""
+        from model.inception import Inception
+        from model.lpips import LPIPS
+
+        if config.lpips != "none":
+            LPIPS.files(config.lpips_folder, config.lpips)
+        if config.inception:
+            Inception.file(config.inception_folder)
 
     def slug(self, config: EvaluateConfig) -> str:
         return "-".join(config.splits)
@@ -119,7 +132,7 @@ class Evaluate(MapStage):
         summary["device"] = costs.device_bytes(scene.baked, scene.atlas)
         summary["storage"] = costs.storage(site, scene.baked)
         timing: dict[str, Any] = {}
-        missing = report.always_missing(config.lpips)
+        missing = report.without_weights(config.lpips, config.inception)
         if drawn_by is None:
             missing.append(report.NO_OPENGL)
         elif config.timing_frames:
@@ -129,12 +142,14 @@ class Evaluate(MapStage):
             missing += _page(config, scene, site, cameras, summary, timing)
         clips = drive.videos(scene, inputs["capture"], config.video_frames, drawn_by is not None, draft.files)
         about = report.About(inputs, draft.key, config.model_dump(mode="json"), drawn_by)
-        write_json(draft.files / "metrics.json", summary)
-        write_json(draft.files / "timing.json", timing)
 
         def picture(frame: str, name: str) -> bytes:
             return draft.read(frame, (f"{name}.png",)).members[f"{name}.png"]
 
+        if config.inception:
+            summary["distributions"] = _distributions(config, scene, inputs["capture"], summary, picture)
+        write_json(draft.files / "metrics.json", summary)
+        write_json(draft.files / "timing.json", timing)
         html = report.page(about, summary, timing, missing, clips, picture)
         (draft.files / "report.html").write_text(html, encoding="utf-8")
         (draft.files / "overview.png").write_bytes(report.overview(summary, picture))
@@ -145,6 +160,25 @@ class Evaluate(MapStage):
 
     def check(self, draft: Draft) -> None:
         assert (draft.files / "report.html").is_file(), "evaluate wrote no report"
+
+
+def _distributions(
+    config: EvaluateConfig,
+    scene: Scene,
+    capture: Artifact,
+    summary: dict[str, Any],
+    picture: Callable[[str, str], bytes],
+) -> list[dict[str, Any]]:
+    """FID and KID of views beside the drive, against the photos along it."""
+    from stages.neuras.evaluation import distributions
+    from stages.neuras.records import frames
+
+    sets, pictures = distributions.photographed(summary["groups"], picture)
+    if not sets:
+        along = [split for split in config.splits if split != "shift"]
+        sets, pictures = distributions.imagined(scene, capture, along, config.shifts_m, config.warping_views)
+    photos = (frame.image() for frame in frames(capture, "train", "validation", "test"))
+    return distributions.judge(sets, pictures, photos, config.inception_folder)
 
 
 def _page(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from model.lpips import LPIPS, NETWORKS
+from model.lpips import LPIPS, NETWORKS, Features
+from model.weights import WeightFile
 
 # torchvision's networks: convolutions by number, as (stride, padding), after which the features are compared; "pool" between
 WRITTEN_OUT = {
@@ -24,25 +26,22 @@ def write_weights(folder: Path, network: str) -> None:
     """Random weights in the layout of the published files."""
     torch.manual_seed(1)
     spec = NETWORKS[network]
-    metric = LPIPS(network)
+    metric = LPIPS(Features(network))
     features = {"classifier.0.weight": torch.zeros(1)}
     number = 0
-    for layer, stage in zip(spec["layers"], metric.stages, strict=True):
+    for layer, stage in zip(spec["layers"], metric.features.stages, strict=True):
         if len(layer) == 4:
             features[f"features.{number}.weight"] = torch.randn_like(stage.weight) / math.sqrt(stage.weight[0].numel())
             features[f"features.{number}.bias"] = torch.randn_like(stage.bias) * 0.1
         number += 2 if len(layer) == 4 else 1  # a ReLU follows each convolution
-    torch.save(features, folder / spec["features"][0])
     linear = {f"lin{i}.model.1.weight": torch.rand_like(parameter) for i, parameter in enumerate(metric.linear)}
-    torch.save(linear, folder / spec["linear"][0])
+    for tensors, file in zip((features, linear), spec["files"], strict=True):
+        torch.save(tensors, folder / file.name)
 
 
-def distance(folder: Path, network: str, a: np.ndarray, b: np.ndarray) -> float:
-    """Between (3, H, W) images in [0, 1], by the weight files in ``folder``; convolutions are sums over shifted images."""
-    features, linear = (
-        {key: value.double().numpy() for key, value in torch.load(folder / spec[0], weights_only=True).items()}
-        for spec in (NETWORKS[network]["features"], NETWORKS[network]["linear"])
-    )
+def levels(folder: Path, network: str, image: np.ndarray) -> Iterator[np.ndarray]:
+    """(C, h, w) of each compared layer, of a (3, H, W) image in [0, 1]; convolutions are sums over shifted images."""
+    features = _arrays(folder, NETWORKS[network]["files"][0])
     layers, geometry, compared, pool_size = WRITTEN_OUT[network]
 
     def convolve(x, number):
@@ -62,14 +61,25 @@ def distance(folder: Path, network: str, a: np.ndarray, b: np.ndarray) -> float:
             [x[:, i : i + 2 * rows : 2, j : j + 2 * columns : 2] for i, j in np.ndindex(pool_size, pool_size)], axis=0
         )
 
-    def levels(image):
-        x = (2 * image - 1 - MEAN) / DEVIATION
-        for layer in layers:
-            x = pool(x) if layer == "pool" else convolve(x, layer)
-            if layer in compared:
-                yield x / (np.sqrt((x**2).sum(axis=0)) + 1e-10)
+    x = (2 * image - 1 - MEAN) / DEVIATION
+    for layer in layers:
+        x = pool(x) if layer == "pool" else convolve(x, layer)
+        if layer in compared:
+            yield x
+
+
+def distance(folder: Path, network: str, a: np.ndarray, b: np.ndarray) -> float:
+    """Between (3, H, W) images in [0, 1], by the weight files in ``folder``."""
+    linear = _arrays(folder, NETWORKS[network]["files"][1])
+
+    def directions(image):
+        return (x / (np.sqrt((x**2).sum(axis=0)) + 1e-10) for x in levels(folder, network, image))
 
     return sum(
         ((x - y) ** 2 * linear[f"lin{i}.model.1.weight"][0]).sum(axis=0).mean()
-        for i, (x, y) in enumerate(zip(levels(a), levels(b), strict=True))
+        for i, (x, y) in enumerate(zip(directions(a), directions(b), strict=True))
     )
+
+
+def _arrays(folder: Path, file: WeightFile) -> dict[str, np.ndarray]:
+    return {key: value.double().numpy() for key, value in torch.load(folder / file.name, weights_only=True).items()}

@@ -7,9 +7,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from model.lpips import LPIPS
+from model.lpips import LPIPS, NETWORKS
 from model.renderformer.losses import image_loss, log_radiance, tone_map
+from model.weights import LPIPS_SET
 from tests.model.lpips import distance, write_weights
 
 
@@ -35,6 +37,18 @@ def test_lpips_from_files(tmp_path, network):
     assert torch.equal(metric(a, a), torch.zeros(2))
     near, far = metric(a, (a + 0.02).clamp(0, 1)), metric(a, 1 - a)
     assert (near > 0).all() and (far > near).all()
+
+
+@pytest.mark.parametrize(("network", "wanted"), [("alex", (0.722, 0.138)), ("vgg", (0.569, 0.422))])
+def test_the_published_weights_give_the_published_distances(shared_data, network, wanted):
+    """Of the images that the metric's authors distribute with it."""
+    if not all((LPIPS_SET.folder() / file.name).is_file() for file in NETWORKS[network]["files"]):
+        pytest.skip(f"no weights in {LPIPS_SET.folder()}: lightmill weights lpips")
+    files = (shared_data / "lpips" / f"ex_{name}.png" for name in ("ref", "p0", "p1"))
+    reference, *others = (torch.from_numpy(np.array(Image.open(path))[..., :3] / 255).float() for path in files)
+    reference, *others = (image.permute(2, 0, 1)[None] for image in (reference, *others))
+    metric = LPIPS.load(None, network)
+    assert [metric(reference, other).item() for other in others] == pytest.approx(wanted, abs=1e-3)
 
 
 @pytest.mark.parametrize("network", ["vgg", "alex"])
@@ -81,12 +95,14 @@ def test_lpips_gradient_is_finite_also_on_black(tmp_path):
         assert y.grad.isfinite().all() and y.grad.abs().sum() > 0
 
 
-def test_missing_lpips_weights_say_where_to_get_them(tmp_path):
+def test_missing_lpips_weights_say_where_to_get_them(tmp_path, monkeypatch):
+    monkeypatch.delenv("LIGHTMILL_LPIPS", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     with pytest.raises(ValueError, match=r"vgg16-397923af.pth.*https://.*lpips=0"):
         LPIPS.load(tmp_path)
-    with pytest.raises(ValueError, match="lpips_folder"):
+    with pytest.raises(ValueError, match="cache.*lightmill weights lpips.*lpips_folder"):
         LPIPS.load(None)
     write_weights(tmp_path, "vgg")
     torch.save({"lin0": torch.zeros(1)}, tmp_path / "vgg.pth")
-    with pytest.raises(ValueError, match="do not hold"):
+    with pytest.raises(ValueError, match="does not hold"):
         LPIPS.load(tmp_path)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import linalg
 
 from pipeline.errors import UserError
 from pipeline.run import run_pipeline
@@ -16,10 +18,11 @@ from stages import cli
 from stages.graphics import metrics
 from stages.graphics.arrays import unpack_json
 from stages.neuras.baking import browser, drawing
-from stages.neuras.evaluation import drive, paths, report, scores, summary
+from stages.neuras.evaluation import distributions, drive, paths, report, scores, summary
 from stages.neuras.evaluation.renderers import as_bytes, opengl
 from stages.neuras.evaluation.warping import Source, Warping
 from stages.neuras.records import FrameRecord
+from tests.model import inception, lpips
 from tests.neuras import line, scenes
 
 QUICK = {"video_frames": 4, "timing_frames": 1, "timing_size": [64, 36], "page_views": 0}
@@ -230,6 +233,114 @@ def test_without_opengl_and_browser_the_report_says_what_is_missing(run, no_open
         assert words in html
     assert artifacts["evaluate"].file("drive.mp4").stat().st_size > 500
     assert json.loads(artifacts["evaluate"].file("timing.json").read_bytes()) == {}
+
+    assert "lightmill weights lpips" in html and "lightmill weights inception" in html
+
+
+# -- with weights
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A folder with random weights of every network, in the published layout."""
+    folder = tmp_path_factory.mktemp("weights")
+    lpips.write_weights(folder, "alex")
+    inception.write_weights(folder)
+    return str(folder)
+
+
+WEIGHED = {**QUICK, "video_frames": 0, "timing_frames": 0}
+
+
+def test_lpips_is_in_records_report_and_table_where_weights_are(run, weights, capsys):
+    artifacts, _ = run(evaluate={**WEIGHED, "lpips": "alex", "lpips_folder": weights})
+    for id, row in views_of(artifacts["evaluate"]).items():
+        photo, ours = (picture(artifacts["evaluate"], id, name).transpose(2, 0, 1) / 255 for name in ("photo", "ours"))
+        assert row["scores"]["ours"]["lpips_alex"] == pytest.approx(
+            lpips.distance(Path(weights), "alex", photo, ours), rel=1e-3
+        )
+    html = artifacts["evaluate"].file("report.html").read_text()
+    assert "LPIPS (AlexNet)" in html and "lightmill weights lpips" not in html
+    artifact = artifacts["evaluate"]
+    assert lightmill("scores", f"a={artifact.key}", f"b={artifact.key}", "--store", str(artifact.path.parents[2])) == 0
+    assert "between frames: LPIPS (AlexNet)" in capsys.readouterr().out
+
+
+def test_fid_and_kid_are_of_the_pictures_beside_the_drive(run, weights, capsys):
+    artifacts, _ = run(evaluate={**WEIGHED, "inception": True, "inception_folder": weights})
+    artifact, capture = artifacts["evaluate"], artifacts["capture"]
+    sets = {row["label"]: row for row in json.loads(artifact.file("metrics.json").read_bytes())["distributions"]}
+    assert set(sets) == {"2 m to the left", "2 m, both sides"}  # one view to the right is too few
+    ids = [id for id, (split, _, _) in line.PLACES.items() if split == "shift"]
+    photos = [id for id, (split, _, _) in line.PLACES.items() if split != "shift"]
+    features = distributions.extractor(weights)
+    images = (np.array(Image.open(io.BytesIO(capture.read(id).members["image.png"]))) for id in photos)
+    reference = np.array([features(image) for image in images])
+    row = sets["2 m, both sides"]
+    assert row["views"] == len(ids) and row["photos"] == len(photos)
+    for method, found in row["methods"].items():
+        of_method = np.array([features(picture(artifact, id, method)) for id in ids])
+        assert found["fid"] == pytest.approx(distributions.frechet(reference, of_method), rel=1e-5)
+        assert found["kid"] == pytest.approx(distributions.kernel_distance(reference, of_method), abs=1e-5)
+    assert set(row["methods"]) >= {"photo", "ours", "warping"} and row["methods"]["photo"] != row["methods"]["ours"]
+    html = artifact.file("report.html").read_text()
+    assert "FID" in html and f"{len(ids)} views against {len(photos)} photos" in html and "the truth there" in html
+    assert "lightmill weights inception" not in html
+    assert lightmill("scores", f"a={artifact.key}", f"b={artifact.key}", "--store", str(artifact.path.parents[2])) == 0
+    assert "2 m, both sides: FID" in capsys.readouterr().out
+
+
+def test_without_frames_beside_the_drive_the_cameras_are_moved(run, weights):
+    values = {**WEIGHED, "splits": ["test"], "inception": True, "inception_folder": weights, "shifts_m": [0.5, 1.5]}
+    artifacts, _ = run(evaluate=values)
+    rows = json.loads(artifacts["evaluate"].file("metrics.json").read_bytes())["distributions"]
+    sets = {row["label"]: row for row in rows}
+    assert list(sets) == [
+        f"{metres} m{where}" for metres in ("0.5", "1.5") for where in (" to the left", " to the right", ", both sides")
+    ]
+    assert [row["views"] for row in rows] == [2, 2, 4] * 2 and set(rows[0]["methods"]) == {"ours", "warping"}
+    values = [row["methods"]["ours"]["fid"] for row in rows]
+    assert len(set(values)) == len(values)
+
+
+def test_missing_weights_are_missed_before_anything_runs(run, tmp_path):
+    for name in ("lpips", "inception"):
+        chosen = {"lpips": "vgg"} if name == "lpips" else {"inception": True}
+        with pytest.raises(ValueError, match=f"lightmill weights {name}"):
+            run(evaluate={**WEIGHED, **chosen, f"{name}_folder": str(tmp_path)}, fit={"error": 0.123})
+
+
+# -- distributions
+
+
+def sets(seed: int, count: int, dimensions: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.normal(0.3 * seed, 1, (count, dimensions)) @ rng.normal(0, 1, (dimensions, dimensions))
+
+
+@pytest.mark.parametrize(("counts", "dimensions"), [((60, 90), 20), ((9, 12), 20)])
+def test_frechet_distance_equals_the_formula_of_covariances(counts, dimensions):
+    a, b = sets(1, counts[0], dimensions), sets(2, counts[1], dimensions)
+    covariances = [np.cov(x, rowvar=False) for x in (a, b)]
+    root = linalg.sqrtm(covariances[0] @ covariances[1] + 1e-9 * np.eye(dimensions))
+    trace = np.trace(covariances[0] + covariances[1] - 2 * np.real(root))
+    wanted = np.square(a.mean(axis=0) - b.mean(axis=0)).sum() + trace
+    assert distributions.frechet(a, b) == pytest.approx(wanted, rel=1e-4)
+    assert distributions.frechet(a, a) == pytest.approx(0, abs=1e-6 * wanted)
+
+
+def test_kernel_distance_equals_its_sums_and_has_no_bias():
+    a, b = sets(1, 7, 4), sets(2, 5, 4)
+
+    def kernel(x, y):
+        return (float(np.dot(x, y)) / 4 + 1) ** 3
+
+    within = [np.mean([kernel(x[i], x[j]) for i in range(len(x)) for j in range(len(x)) if i != j]) for x in (a, b)]
+    wanted = sum(within) - 2 * np.mean([kernel(x, y) for x in a for y in b])
+    assert distributions.kernel_distance(a, b) == pytest.approx(wanted, rel=1e-9)
+    rng = np.random.default_rng(3)
+    values = [distributions.kernel_distance(rng.normal(size=(6, 3)), rng.normal(size=(9, 3))) for _ in range(2000)]
+    assert abs(np.mean(values)) < 3 * np.std(values) / np.sqrt(len(values))
 
 
 def test_the_page_is_compared_with_torch(run):

@@ -13,13 +13,18 @@ from PIL import Image
 from pydantic import ValidationError
 
 from model.neuras.baked import Baked
+from model.weights import VGG16
 from pipeline.errors import UserError
+from pipeline.plan import plan_stage
 from pipeline.store.draft import Draft
+from pipeline.store.files import hash_file
 from stages.graphics.arrays import pack_json
 from stages.graphics.cameras import Camera
+from stages.graphics.page import png
 from stages.neuras.rasterizing.casting import Caster
 from stages.neuras.records import FRAME, CaptureInfo, FrameRecord, save
 from stages.neuras.s03_fit import Fit, FitStageConfig
+from tests.model.lpips import write_weights
 from tests.neuras import scenes
 
 CONFIG = FitStageConfig(
@@ -135,7 +140,77 @@ def test_without_training_frames_it_says_so(tmp_path, inputs):
         run(tmp_path / "out", {**inputs, "capture": only_tests})
 
 
-@pytest.mark.parametrize(("values", "words"), [({"layers": 1}, "layers=1"), ({"sky_far_m": 10}, "sky_far_m=10")])
+# -- the perceptual loss by VGG
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("weights")
+    write_weights(folder, "vgg")
+    return folder
+
+
+def with_vgg(folder, **values) -> FitStageConfig:
+    chosen = {
+        "perceptual_network": "vgg",
+        "perceptual": 0.01,
+        "lpips_folder": str(folder),
+        "patch": 16,
+        "patches": 4,
+        "steps": 6,
+    }
+    return FitStageConfig(**{**CONFIG.model_dump(), **chosen, "checkpoint_every": 2, **values})
+
+
+def test_vgg_enters_the_fit_and_its_key_by_content(tmp_path, inputs, weights, monkeypatch):
+    config = with_vgg(weights)
+    made, products = run(tmp_path / "vgg", inputs, config)
+    rows = [json.loads(text) for text in (made.state / "log.jsonl").read_text().splitlines()]
+    assert rows[0]["perceptual"] > 0
+    assert run(tmp_path / "again", inputs, config)[1] == products
+    without = with_vgg(weights, perceptual_network="gradients")
+    assert run(tmp_path / "gradients", inputs, without)[1]["model.safetensors"] != products["model.safetensors"]
+
+    def key(config: FitStageConfig) -> str:
+        return plan_stage("neuras", Fit(), config, {}, hash_file).key
+
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / VGG16.name).write_bytes((weights / VGG16.name).read_bytes())
+    assert key(with_vgg(other)) == key(config) != key(without)
+    with (other / VGG16.name).open("ab") as file:
+        file.write(b"0")
+    assert key(with_vgg(other)) != key(config)
+    with pytest.raises(ValueError, match="lightmill weights lpips"):
+        key(with_vgg(tmp_path))
+    assert key(with_vgg(tmp_path, perceptual_network="gradients")) == key(without)  # which looks for no weights
+
+
+def test_masked_pixels_teach_nothing_through_vgg(tmp_path, inputs, weights):
+    def spoiled(value: int):
+        records = {}
+        for id, record in inputs["capture"].records.items():
+            frame = FrameRecord.from_record(record)
+            image, mask = frame.image().copy(), np.full(frame.image().shape[:2], 255, np.uint8)
+            image[4:14, 8:20], mask[4:14, 8:20] = value, 0
+            records[id] = dataclasses.replace(frame, picture=png(image), mask=png(mask)).to_record()
+        capture = Folder(tmp_path / f"capture{value}", records.values())
+        capture.file("capture.json").write_bytes(inputs["capture"].file("capture.json").read_bytes())
+        return {**inputs, "capture": capture}
+
+    black, white = (run(tmp_path / f"{value}", spoiled(value), with_vgg(weights))[1] for value in (0, 255))
+    assert black["model.safetensors"] == white["model.safetensors"]
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"layers": 1}, "layers=1"),
+        ({"sky_far_m": 10}, "sky_far_m=10"),
+        ({"perceptual_network": "vgg", "perceptual": 0.1}, "patch=8 is too small for VGG16.*patch=32 patches=8"),
+        ({"perceptual_network": "vgg", "patch": 32}, "perceptual=0"),
+    ],
+)
 def test_settings_that_cannot_be_are_refused(values, words):
     with pytest.raises(ValidationError, match=words):
         FitStageConfig(**values)

@@ -19,6 +19,8 @@ from stages.graphics.metrics import Metric
 from stages.graphics.page import Cell, Clip, Picture, Table, embed, render
 from stages.graphics.statistics import decided
 from stages.neuras.baking.drawing import INSTALL
+from stages.neuras.evaluation.distributions import METRICS as DISTRIBUTION_METRICS
+from stages.neuras.evaluation.distributions import TRUTH
 from stages.neuras.evaluation.scores import PLACES, SEEN, told
 from stages.neuras.evaluation.summary import METHODS
 from stages.neuras.evaluation.views import GAIN
@@ -64,11 +66,16 @@ class About:
         }
 
 
-def always_missing(lpips: str) -> list[str]:
-    """What no run of these settings has, and what would give it."""
-    missing = ["FID and KID at the shifts: they need the weights of an Inception network, and are not built yet."]
+def without_weights(lpips: str, inception: bool) -> list[str]:
+    """What these settings leave out because it needs published weights, and what would give it."""
+    missing = []
     if lpips == "none":
-        missing.append("LPIPS: needs published weights. `evaluate.lpips=vgg evaluate.lpips_folder=FOLDER`, or alex.")
+        missing.append("LPIPS: `lightmill weights lpips` fetches its networks, then run with `evaluate.lpips=vgg`, or alex.")
+    if not inception:
+        missing.append(
+            "FID and KID beside the drive: `lightmill weights inception` fetches their network, then run with "
+            "`evaluate.inception=true`."
+        )
     return missing
 
 
@@ -147,6 +154,23 @@ def score_table(groups: Sequence[Group]) -> Table:
 
 def _score(metric: Metric, value: Mapping[str, Any], best: bool) -> Cell:
     return Cell(metric.format(value["mean"]), _interval(metric, value, "").strip(), kind="best" if best else "")
+
+
+def distribution_table(summary: Summary) -> Table | None:
+    """FID and KID beside the drive, of the truth where it is known and of every method; None where they were not measured."""
+    sets = summary.get("distributions")
+    if not sets:
+        return None
+    columns = list(sets[0]["methods"])
+    rows = []
+    for row in sets:
+        methods = [method for method in columns if method != TRUTH]
+        for number, (name, metric) in enumerate(DISTRIBUTION_METRICS.items()):
+            best = min(methods, key=lambda method: row["methods"][method][name])
+            about = Cell(row["label"], f"{row['views']} views against {row['photos']} photos", kind="strong")
+            cells = [Cell(metric.format(row["methods"][m][name]), kind="best" if m == best else "") for m in columns]
+            rows.append([about if number == 0 else "", metric.heading, *cells])
+    return Table(["views", "metric", *(METHODS.get(method, "the truth there") for method in columns)], rows, numeric=True)
 
 
 def error_table(groups: Sequence[Group]) -> Table | None:
@@ -319,6 +343,7 @@ def page(
         tiles=tiles(summary, timing),
         scores=score_table(main_groups(summary)),
         sides=_sides(summary),
+        distributions=distribution_table(summary),
         errors=error_table(summary["groups"]),
         tolerance=about.config["depth_tolerance"],
         agreement=agreement_table(summary),

@@ -12,6 +12,7 @@ from pipeline.store import Store
 from stages.graphics.metrics import Metric
 from stages.graphics.page import Table, markdown
 from stages.graphics.statistics import bootstrap, with_interval
+from stages.neuras.evaluation.distributions import METRICS as DISTRIBUTION_METRICS
 from stages.neuras.evaluation.report import main_groups
 from stages.neuras.evaluation.scores import told
 from stages.neuras.evaluation.summary import METHODS
@@ -59,9 +60,23 @@ def side_by_side(runs: Sequence[Run]) -> Table:
             means = [metric.format(sum(column) / len(column)) for column in scores]
             gains = [_gain(metric, scores[0], column) for column in scores[1:]]
             rows.append([f"{group['label']}: {metric.heading}", *means, *gains])
+    rows += _distributions(runs)
     rows.append(["stored (MB)", *(f"{run.summary['storage']['stored'] / 1e6:.2f}" for run in runs), *[None] * len(columns)])
     better = [f"{first.name} better than {name}" for name, _, _ in columns[1:]]
     return Table(["views and metric", *(name for name, _, _ in columns), *better], rows, numeric=True)
+
+
+def _distributions(runs: Sequence[Run]) -> list[list[Any]]:
+    """FID and KID beside the drive, where every run has them. They are of whole sets, so there is no pair to subtract."""
+    measured = [{row["label"]: row for row in run.summary.get("distributions", [])} for run in runs]
+    rows: list[list[Any]] = []
+    for label in measured[0]:
+        if all(label in sets for sets in measured):
+            for name, metric in DISTRIBUTION_METRICS.items():
+                values = [sets[label]["methods"]["ours"][name] for sets in measured]
+                values.append(measured[0][label]["methods"]["warping"][name])
+                rows.append([f"{label}: {metric.heading}", *map(metric.format, values), *[None] * len(runs)])
+    return rows
 
 
 def _gain(metric: Metric, ours: Sequence[float], theirs: Sequence[float]) -> str:
