@@ -55,7 +55,7 @@ NEURAS = (
     "capture.length=90", "capture.texture_size=64", "capture.training_frames=3", "capture.width=96", "capture.height=54",
     "capture.spp=1", "capture.shifts=[-2.0,2.0]", "capture.shift_frames=2", "capture.columns=90", "capture.beams=32",
     "scaffold.voxel_m=0.2", "scaffold.depth=8", "scaffold.faces=4000", "scaffold.speck_faces=4", "scaffold.cull_rays=1",
-    "atlas.tile_faces=500", "fit.steps=60", "fit.patches=32", "fit.sky_side=32", "fit.codes=64", "fit.device=cpu",
+    "atlas.tile_faces=500", "fit.steps=200", "fit.sky_side=32", "fit.codes=64", "fit.device=cpu",
     "fit.checkpoint_every=5", "fit.log_every=1", "fit.validate_every=13", "evaluate.video_frames=2", "evaluate.timing_frames=1",
     "evaluate.timing_size=[64,36]", "evaluate.page_views=1", "workers=2",
 )  # fmt: skip
@@ -132,7 +132,7 @@ class Run:
         self.output = store / ".output.txt"
         with open(self.output, "w") as file:
             self.process = subprocess.Popen(campaign.command(store), cwd=ROOT, stdout=file, stderr=subprocess.STDOUT)
-        self.began = time.monotonic()
+        self.began, self.began_at = time.monotonic(), time.time()
         self.at_work: float | None = None  # seconds after the start
 
     def text(self) -> str:
@@ -332,12 +332,17 @@ class Striker:
         """The tars of the undisturbed run's artifact: none of a run stage."""
         return list(self.calm.glob(f"{stage}/*/parts/*.tar"))
 
+    def starts(self, stage: str) -> list[str]:
+        """What appears in the draft where a random time may begin: the draft itself, or the first of many steps."""
+        return ["", "/state/log.jsonl"] if "steps" in Store(self.calm).resolve(stage).manifest["config"] else [""]
+
     def strike(self, run: Run, stage: str, worker: bool) -> bool:
         """Kill the runner or a worker at a random point of the stage; False if the run ended before."""
         if self.random.random() < 0.5:
             delay = self.random.uniform(0, 0.9 * self.left(run.store, stage))
             aim = f"{delay:.2f} s into {stage}"
-            arrived = run.wait_until(lambda: bool(list(run.store.glob(f"{stage}/*.partial"))))
+            start, since = self.random.choice(self.starts(stage)), run.began_at
+            arrived = run.wait_until(lambda: written(run.store, f"{stage}/*.partial{start}", since) > 0)
             began = time.monotonic()
             arrived = arrived and run.wait_until(lambda: time.monotonic() - began > delay)
         else:
