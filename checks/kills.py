@@ -207,10 +207,10 @@ def where(store: Path) -> str:
             phase = "commit, manifest"
         elif (draft / "items.jsonl").exists():
             phase = "commit, listings"
-        elif any((draft / "files").iterdir()):
-            phase = "files"
         elif (draft / "state" / "log.jsonl").exists():
             phase = "steps"
+        elif any((draft / "files").iterdir()):
+            phase = "files"
         return f"{draft.parent.name}: {phase}"
     return "between stages"
 
