@@ -251,7 +251,8 @@ def differences(calm: Path, killed: Path, stages: Sequence[str]) -> list[str]:
         found += [f"{stage}: {problem}" for problem in b.verify(deep=True)]
         files = [other_files(artifact) for artifact in (a, b)]
         unequal = sorted(name for name in files[0].keys() | files[1] if files[0].get(name) != files[1].get(name))
-        found += [f"{stage}: files/{name} differs" for name in unequal]
+        if a.digest == b.digest:  # else it is said already
+            found += [f"{stage}: files/{name} differs" for name in unequal]
         logs = [artifact.path / "files" / "log.jsonl" for artifact in (a, b)]
         if logs[0].exists() and rows(logs[0]) != rows(logs[1]):
             found.append(f"{stage}: the loss logs differ")
