@@ -3,13 +3,16 @@
     python checks/kills.py --what synthetic --kills 150 --seed 0
     python checks/kills.py --what data --kills 50
     python checks/kills.py --what train --kills 30
+    python checks/kills.py --what neuras --kills 36
 
-*synthetic* is the toy system of tests/pipeline/toy.py, *data* the line from collect to shard, *train* training on such shards.
+*synthetic* is the toy system of tests/pipeline/toy.py, *data* the line from collect to shard, *train* training on such shards,
+*neuras* the line of that system from a tiny street to its report.
 A run is started, struck once or twice by SIGKILL (its runner; or one of its workers, after which it must go on by itself),
-started again and so on until one run ends; then digests (of training also the loss log) must be those of the undisturbed
-run, every byte must verify, and no part that was finished when a kill struck may have been written again. Then the next round
-begins from nothing. Half of the kills wait a random time, the others for a moment that is short: a part just finished, a
-listing, a manifest, a commit. Exits non-zero at any difference. ``--store`` keeps the undisturbed run for the next slice.
+started again and so on until one run ends; then digests and files (of training also the loss log) must be those of the
+undisturbed run, every byte must verify, and no part that was finished when a kill struck may have been written again. Then the
+next round begins from nothing. Each kill aims at the stage that was struck least. Half of them wait a random time in it, the
+others for a moment that is short: a part just finished, a listing, a manifest, a commit. Exits non-zero at any difference.
+``--store`` keeps the undisturbed run for the next slice.
 """
 
 from __future__ import annotations
@@ -27,12 +30,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import psutil
 
-from pipeline.store import Store  # noqa: E402
+from pipeline.store import Artifact, Store
 from pipeline.store.folder import PLACES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,11 +51,23 @@ TRAIN = (
     "model.view_transformer_latent_dim=128", "model.view_transformer_n_heads=1", "model.view_transformer_ffn_hidden_dim=512",
     "model.view_transformer_n_layers=4",
 )  # fmt: skip
+NEURAS = (
+    "capture.length=90", "capture.texture_size=64", "capture.training_frames=3", "capture.width=96", "capture.height=54",
+    "capture.spp=1", "capture.shifts=[-2.0,2.0]", "capture.shift_frames=2", "capture.columns=90", "capture.beams=32",
+    "scaffold.voxel_m=0.2", "scaffold.depth=8", "scaffold.faces=4000", "scaffold.speck_faces=4", "scaffold.cull_rays=1",
+    "atlas.tile_faces=500", "fit.steps=200", "fit.sky_side=32", "fit.codes=64", "fit.device=cpu",
+    "fit.checkpoint_every=5", "fit.log_every=1", "fit.validate_every=13", "evaluate.video_frames=2", "evaluate.timing_frames=1",
+    "evaluate.timing_size=[64,36]", "evaluate.page_views=1", "workers=2",
+)  # fmt: skip
+NEURAS_STAGES = ("capture", "scaffold", "atlas", "fit", "bake", "evaluate")
 MEASURED = ("seconds", "scenes_per_s", "tokens_per_s", "memory_gb", "mfu")  # of a log row; all else must be equal
+MEASURED_FILES = ("log.jsonl", "timing.json", "report.html", "tensorboard/*")  # hold times; other files must be equal
 # Pattern of what appears -> at most so many of them are waited for.
 COMMIT = {"{stage}/*.partial/items.jsonl": 1, "{stage}/*.partial/manifest.json": 1, "{stage}/*-*/manifest.json": 1}
-PARTS = {"{stage}/*.partial": 1, "{stage}/*.partial/markers/[!.]*.json": 4, "{stage}/*.partial/parts/*.tar": 4, **COMMIT}
-CHECKPOINTS = {"{stage}/*.partial/state/*": 1, "{stage}/*.partial/state/.*": 1, "{stage}/*.partial/files/*": 2, **COMMIT}
+FILES = {"{stage}/*.partial/files/**/*": 2}
+PARTS = {"{stage}/*.partial": 1, "{stage}/*.partial/markers/[!.]*.json": 4, "{stage}/*.partial/parts/*.tar": 4}
+CHECKPOINTS = {"{stage}/*.partial/state/*": 1, "{stage}/*.partial/state/.*": 1}
+MAP_MOMENTS, RUN_MOMENTS = PARTS | FILES | COMMIT, CHECKPOINTS | FILES | COMMIT
 KILLS_PER_ROUND = 6
 PATIENCE_S = 3600.0  # no run here takes so long, even on a busy machine: one that does hangs
 
@@ -63,7 +79,6 @@ class Campaign:
     command: Callable[[Path], list[str]]
     stages: tuple[str, ...]  # their places in a store; made anew in each round; others are taken from the undisturbed run
     begun: str = " running "  # in the output: from here on there is something to lose
-    moments: dict[str, int] = field(default_factory=lambda: PARTS)
 
 
 def meshes(folder: Path) -> Path:
@@ -79,9 +94,16 @@ def meshes(folder: Path) -> Path:
 
 def line(stage: str, overrides: Sequence[str], stages: tuple[str, ...], **more: Any) -> Campaign:
     def command(store: Path) -> list[str]:
-        source = ["collect=folder", f"collect.path={meshes(store.parent / 'meshes')}"]
         where = [f"store={store}", f"hydra.run.dir={store}/.runs"]
-        return [sys.executable, "-m", "pipeline", f"stage={stage}", *where, *source, *overrides]
+        return [sys.executable, "-m", "pipeline", f"stage={stage}", *where, *overrides]
+
+    return Campaign(command, stages, **more)
+
+
+def renderformer(stage: str, overrides: Sequence[str], stages: tuple[str, ...], **more: Any) -> Campaign:
+    def command(store: Path) -> list[str]:
+        source = ["collect=folder", f"collect.path={meshes(store.parent / 'meshes')}"]
+        return [*line(stage, overrides, stages).command(store), *source]
 
     return Campaign(command, stages, **more)
 
@@ -95,8 +117,9 @@ def synthetic(store: Path) -> list[str]:
 
 CAMPAIGNS = {
     "synthetic": Campaign(synthetic, ("toy/numbers", "toy/squares", "toy/total")),
-    "data": line("shard", DATA, ("collect", "remesh", "decimate", "scene", "render", "shard")),
-    "train": line("train", (*DATA, *TRAIN), ("train",), begun="parameters (", moments=CHECKPOINTS),
+    "data": renderformer("shard", DATA, ("collect", "remesh", "decimate", "scene", "render", "shard")),
+    "train": renderformer("train", (*DATA, *TRAIN), ("train",), begun="parameters ("),
+    "neuras": line("evaluate", ("system=neuras", *NEURAS), tuple(f"neuras/{stage}" for stage in NEURAS_STAGES)),
 }
 
 
@@ -109,7 +132,7 @@ class Run:
         self.output = store / ".output.txt"
         with open(self.output, "w") as file:
             self.process = subprocess.Popen(campaign.command(store), cwd=ROOT, stdout=file, stderr=subprocess.STDOUT)
-        self.began = time.monotonic()
+        self.began, self.began_at = time.monotonic(), time.time()
         self.at_work: float | None = None  # seconds after the start
 
     def text(self) -> str:
@@ -164,6 +187,15 @@ def draft_of(store: Path) -> Path | None:
     return found[-1] if found else None
 
 
+def written(store: Path, pattern: str, since: float) -> int:
+    """How many matches were written since that time."""
+    count = 0
+    for path in store.glob(pattern):
+        with contextlib.suppress(OSError):
+            count += path.stat().st_mtime >= since
+    return count
+
+
 def where(store: Path) -> str:
     """How far the run in the store is, for the table: stage and phase."""
     with contextlib.suppress(OSError):
@@ -175,10 +207,10 @@ def where(store: Path) -> str:
             phase = "commit, manifest"
         elif (draft / "items.jsonl").exists():
             phase = "commit, listings"
-        elif any((draft / "files").iterdir()):
-            phase = "files"
         elif (draft / "state" / "log.jsonl").exists():
             phase = "steps"
+        elif any((draft / "files").iterdir()):
+            phase = "files"
         return f"{draft.parent.name}: {phase}"
     return "between stages"
 
@@ -199,6 +231,12 @@ def finished(store: Path) -> dict[tuple[str, str], int]:
     return found
 
 
+def other_files(artifact: Artifact) -> dict[str, str]:
+    """Digests of the artifact's files, less those that hold times."""
+    files = artifact.manifest["outputs"]["files"].items()
+    return {name: entry["digest"] for name, entry in files if not any(fnmatch(name, pattern) for pattern in MEASURED_FILES)}
+
+
 def differences(calm: Path, killed: Path, stages: Sequence[str]) -> list[str]:
     """What the killed run's artifacts have other than the undisturbed one's; empty where they are the same."""
     found = []
@@ -211,6 +249,10 @@ def differences(calm: Path, killed: Path, stages: Sequence[str]) -> list[str]:
         if (a.key, a.digest) != (b.key, b.digest):
             found.append(f"{stage}: digest {b.digest[:12]}, not {a.digest[:12]}")
         found += [f"{stage}: {problem}" for problem in b.verify(deep=True)]
+        files = [other_files(artifact) for artifact in (a, b)]
+        unequal = sorted(name for name in files[0].keys() | files[1] if files[0].get(name) != files[1].get(name))
+        if a.digest == b.digest:  # else it is said already
+            found += [f"{stage}: files/{name} differs" for name in unequal]
         logs = [artifact.path / "files" / "log.jsonl" for artifact in (a, b)]
         if logs[0].exists() and rows(logs[0]) != rows(logs[1]):
             found.append(f"{stage}: the loss logs differ")
@@ -236,6 +278,7 @@ class Striker:
         self.campaign, self.calm, self.folder, self.work_s = campaign, calm, folder, work_s
         self.random = random.Random(seed)
         self.tally = Tally()
+        self.aims: Counter = Counter()  # by stage
         self.kept: dict[tuple[str, str], int] = {}
 
     def round(self, kills: int) -> None:
@@ -264,9 +307,12 @@ class Striker:
         run = Run(self.campaign, store)
         try:
             if may_kill and run.begin():
-                to_worker = self.random.random() < 0.4 and "train" not in self.campaign.stages
-                struck = to_worker and self.strike(run, worker=True)
-                if (not struck or self.random.random() < 0.5) and self.strike(run, worker=False):
+                stage = self.aim(store)
+                to_worker = self.random.random() < 0.4 and bool(self.parts(stage))
+                struck = to_worker and self.strike(run, stage, worker=True)
+                if struck:
+                    stage = self.aim(store)
+                if (not struck or self.random.random() < 0.5) and self.strike(run, stage, worker=False):
                     return None
             status = run.end()
         finally:
@@ -276,29 +322,37 @@ class Striker:
             self.tally.retries += text.count("trying it once more") + text.count("starts again")
         return status
 
-    def strike(self, run: Run, worker: bool) -> bool:
-        """Kill the runner or a worker at a random point; False if the run ended before."""
-        began = time.monotonic()
-        left = self.work_s * self.left(run.store)
+    def aim(self, store: Path) -> str:
+        """The stage to strike: of those that the run has yet to make, the one that was aimed at least."""
+        stages = self.campaign.stages
+        stage = min((s for s in stages if not list(store.glob(f"{s}/*-*"))), key=lambda s: self.aims[s], default=stages[-1])
+        self.aims[stage] += 1
+        return stage
+
+    def parts(self, stage: str) -> list[Path]:
+        """The tars of the undisturbed run's artifact: none of a run stage."""
+        return list(self.calm.glob(f"{stage}/*/parts/*.tar"))
+
+    def starts(self, stage: str) -> list[str]:
+        """What appears in the draft where a random time may begin: the draft itself, or the first of many steps."""
+        return ["", "/state/log.jsonl"] if "steps" in Store(self.calm).resolve(stage).manifest["config"] else [""]
+
+    def strike(self, run: Run, stage: str, worker: bool) -> bool:
+        """Kill the runner or a worker at a random point of the stage; False if the run ended before."""
         if self.random.random() < 0.5:
-            delay = self.random.uniform(0, 0.9 * left)
-            aim = f"after {delay:.2f} s"
-            arrived = run.wait_until(lambda: time.monotonic() - began > delay)
+            delay = self.random.uniform(0, 0.9 * self.left(run.store, stage))
+            aim = f"{delay:.2f} s into {stage}"
+            start, since = self.random.choice(self.starts(stage)), run.began_at
+            arrived = run.wait_until(lambda: written(run.store, f"{stage}/*.partial{start}", since) > 0)
+            began = time.monotonic()
+            arrived = arrived and run.wait_until(lambda: time.monotonic() - began > delay)
         else:
-            stage = self.random.choice(
-                [name for name in self.campaign.stages if not list(run.store.glob(f"{name}/*-*"))]
-                or [str(Path(self.campaign.stages[0]).with_name("*"))]
-            )
-            moments = self.campaign.moments
+            moments = MAP_MOMENTS if self.parts(stage) else RUN_MOMENTS
             pattern = self.random.choice(list(moments))
             number, jitter = self.random.randint(1, moments[pattern]), self.random.uniform(0, 0.004)
-            moment = pattern.format(stage=stage)
-            seen = len(list(run.store.glob(moment)))
-            if seen and "*" not in pattern.rpartition("/")[2]:  # left by an earlier kill: it will be there at once
-                seen = 0
-            arrived = run.wait_until(lambda: len(list(run.store.glob(moment))) >= seen + number, 0.0005)
+            aim, since = f"at {pattern.format(stage=stage)}", time.time()
+            arrived = run.wait_until(lambda: written(run.store, pattern.format(stage=stage), since) >= number, 0.0005)
             time.sleep(jitter)
-            aim = f"at {moment}"
         if worker:
             run.wait_until(lambda: bool(run.workers()), 0.01)
         targets = run.workers() if worker else [run.process]
@@ -324,15 +378,16 @@ class Striker:
         self.tally.again += len(again)
         self.tally.wrong += [f"{stage}: part {name} was finished and made again" for stage, name in again]
 
-    def left(self, store: Path) -> float:
-        """Share of the work that is left, roughly: artifacts or parts against the undisturbed run's."""
-        logs = list(store.glob("train/*.partial/state/log.jsonl"))
-        if "train" in self.campaign.stages:
-            whole = rows(Store(self.calm).resolve("train").file("log.jsonl"))[-1]["step"]
-            done = [row["step"] for row in rows(logs[0])] if logs else []
-            return 1 - (max(done, default=0) / whole)
-        whole = len(inside(self.calm, "*/parts/*.tar"))
-        return max(0.1, 1 - len(inside(store, "*/parts/*.tar")) / whole)
+    def left(self, store: Path, stage: str) -> float:
+        """Seconds that the stage still needs, roughly: the undisturbed run's, by the parts or steps that are missing."""
+        calm = Store(self.calm).resolve(stage)
+        parts, logs = self.parts(stage), list(store.glob(f"{stage}/*.partial/state/log.jsonl"))
+        done = 0.0
+        if parts:
+            done = len(list(store.glob(f"{stage}/*.partial/parts/*.tar"))) / len(parts)
+        elif logs:
+            done = max((row["step"] for row in rows(logs[0])), default=0) / calm.manifest["config"]["steps"]
+        return min(calm.manifest["seconds"], self.work_s) * max(0.1, 1 - done)
 
 
 def undisturbed(campaign: Campaign, store: Path) -> tuple[float, float]:

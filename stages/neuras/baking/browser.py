@@ -1,20 +1,24 @@
-"""Pictures of a baked site as a browser draws them: Chromium without a window, WebGL in software.
+"""A baked site in a browser: Chromium without a window, WebGL in software, led through its DevTools.
 
-The site is served on 127.0.0.1, beside a small page that opens it in a frame, asks for one view after the other and sends back
-what the canvas holds.
+The site is served on 127.0.0.1. Commands and answers are JSON over two pipes, so no port is open and no package is needed; a
+browser whose pipes are closed ends by itself, so none is left where this process is killed.
 """
 
 from __future__ import annotations
 
+import base64
+import contextlib
 import functools
 import io
 import json
-import queue
+import os
+import select
 import shutil
 import subprocess
 import tempfile
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -27,65 +31,22 @@ SOFTWARE = (
     "--headless=new", "--no-sandbox", "--no-first-run", "--disable-extensions", "--use-gl=angle", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--force-device-scale-factor=1", "--force-color-profile=srgb",
 )  # fmt: skip
-ASKING = """<!doctype html><meta charset="utf-8"><iframe id="site" width="1600" height="1000"></iframe><script type="module">
-const send = (name, body) => fetch("/.answers/" + name, { method: "POST", body });
-const pause = () => new Promise((done) => setTimeout(done, 20));
-try {
-  const { links, timing } = await (await fetch("/.questions")).json();
-  const site = document.getElementById("site");
-  site.src = "index.html#still=1";
-  const page = () => site.contentDocument?.documentElement?.dataset.ready;
-  while (!page()) await pause();
-  if (page() === "failed") throw new Error(site.contentDocument.getElementById("message").textContent);
-  const viewer = site.contentWindow.lightmill;
-  for (const link of links) {
-    viewer.follow("#still=1&" + link);
-    await send("picture", await new Promise((done) => viewer.canvas.toBlob(done, "image/png")));
-  }
-  const times = [];
-  for (let i = 0; i < timing; i++) {
+READY = "document.documentElement?.dataset.ready ?? ''"
+TIMES = """(() => {
+  const { gl } = lightmill, times = [];
+  for (let i = 0; i < COUNT; i++) {
     const began = performance.now();
-    viewer.draw();
-    viewer.gl.readPixels(0, 0, 1, 1, viewer.gl.RGBA, viewer.gl.UNSIGNED_BYTE, new Uint8Array(4));
+    lightmill.draw();
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     times.push(performance.now() - began);
   }
-  await send("times", JSON.stringify(times));
-} catch (error) { await send("error", String(error.message ?? error)); }
-</script>"""
+  return times;
+})()"""
 
 
 def find_browser() -> str | None:
     """The path of a Chromium or Chrome, or None."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
-
-
-class _Handler(SimpleHTTPRequestHandler):
-    """Serves the site, and the page that asks for pictures of it."""
-
-    def __init__(self, *words: Any, questions: bytes, answers: queue.Queue[tuple[str, bytes]], **settings: Any):
-        self._questions, self._answers = questions, answers
-        super().__init__(*words, **settings)
-
-    def log_message(self, *words: object) -> None:
-        pass
-
-    def do_GET(self) -> None:
-        special = {"/.asking": ("text/html", ASKING.encode()), "/.questions": ("application/json", self._questions)}
-        if self.path not in special:
-            super().do_GET()
-            return
-        kind, body = special[self.path]
-        self.send_response(200)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-
-    def do_POST(self) -> None:
-        body = self.rfile.read(int(self.headers["Content-Length"]))
-        self._answers.put((self.path.rpartition("/")[2], body))
-        self.send_response(204)
-        self.end_headers()
 
 
 def pictures(site: Path, links: Sequence[str], timing: int = 0, wait_s: float = 180.0) -> tuple[list[np.ndarray], list[float]]:
@@ -94,36 +55,169 @@ def pictures(site: Path, links: Sequence[str], timing: int = 0, wait_s: float = 
 
     Raises RuntimeError without a browser, where the page fails (with its words), or where it is silent for ``wait_s``.
     """
+    with opened(site, "still=1", wait_s=wait_s) as page:
+        images = []
+        for link in links:
+            page.value(f"lightmill.follow({json.dumps('#still=1&' + link)})")
+            images.append(page.canvas())
+        return images, page.value(TIMES.replace("COUNT", str(timing)))
+
+
+@contextlib.contextmanager
+def opened(site: Path, link: str = "", size: tuple[int, int] = (1600, 1000), wait_s: float = 180.0) -> Iterator[Page]:
+    """The site's page, loaded, in a window of ``size``. Raises as ``pictures`` does."""
     browser = find_browser()
     if browser is None:
         raise RuntimeError(f"no browser: install chromium (looked for {', '.join(NAMES)})")
-    answers: queue.Queue[tuple[str, bytes]] = queue.Queue()
-    questions = json.dumps({"links": list(links), "timing": timing}).encode()
-    handler = functools.partial(_Handler, directory=str(site), questions=questions, answers=answers)
-    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    with _served(site) as address, _devtools(browser, wait_s) as devtools:
+        page = Page(devtools, size)
+        page.ask("Page.navigate", url=f"{address}/index.html#{link}")
+        while not (ready := page.value(READY)):
+            devtools.check()
+            time.sleep(0.02)
+        if ready == "failed":
+            raise RuntimeError(f"the page fails: {page.value('document.getElementById(`message`).textContent')}")
+        yield page
+
+
+class Page:
+    """One page of a browser: its values, its pictures, and a person's hands on it. Places are in CSS pixels."""
+
+    def __init__(self, devtools: _DevTools, size: tuple[int, int]):
+        target = devtools.ask("Target.createTarget", None, url="about:blank")["targetId"]
+        self._session = devtools.ask("Target.attachToTarget", None, targetId=target, flatten=True)["sessionId"]
+        self._devtools = devtools
+        width, height = size
+        self.ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.ask("Page.enable")
+
+    def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
+        return self._devtools.ask(method, self._session, **parameters)
+
+    def value(self, script: str) -> Any:
+        """What the script's last expression is, once it is there if it is a promise."""
+        answer = self.ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        if problem := answer.get("exceptionDetails"):
+            raise RuntimeError(f"the page fails: {problem.get('exception', {}).get('description', problem['text'])}")
+        return answer["result"].get("value")
+
+    def canvas(self) -> np.ndarray:
+        """(H, W, 3) uint8: what the page has drawn."""
+        return _pixels(self.value("lightmill.canvas.toDataURL('image/png').split(',')[1]"))
+
+    def screenshot(self) -> np.ndarray:
+        """(H, W, 3) uint8: all that a person sees, with the panel and the photo over the canvas."""
+        return _pixels(self.ask("Page.captureScreenshot", format="png")["data"])
+
+    def place(self, selector: str) -> tuple[float, float, float, float]:
+        """Left, top, width and height of an element."""
+        box = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
+        return tuple(self.value(f"(({{x, y, width, height}}) => [x, y, width, height])({box})"))
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """The left mouse button is pressed at ``start``, moved and released at ``end``."""
+        for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
+            self.ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
+    def click(self, selector: str) -> None:
+        left, top, width, height = self.place(selector)
+        middle = left + width / 2, top + height / 2
+        self.drag(middle, middle)
+
+    @contextlib.contextmanager
+    def held(self, *keys: str) -> Iterator[None]:
+        """These keys, by their names in the web ("w", "ArrowUp", "Shift"), are down meanwhile."""
+        for key in keys:
+            self.ask("Input.dispatchKeyEvent", type="keyDown", key=key)
+        try:
+            yield
+        finally:
+            for key in keys:
+                self.ask("Input.dispatchKeyEvent", type="keyUp", key=key)
+
+
+def _pixels(png: str) -> np.ndarray:
+    return np.array(Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB"))
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    def log_message(self, *words: object) -> None:
+        pass
+
+
+@contextlib.contextmanager
+def _served(site: Path) -> Iterator[str]:
+    """The address at which the folder is served."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Handler, directory=str(site)))
     serving = threading.Thread(target=server.serve_forever, daemon=True)
     serving.start()
-    with tempfile.TemporaryDirectory() as profile:
-        address = f"http://127.0.0.1:{server.server_address[1]}/.asking"
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        serving.join()
+
+
+class _DevTools:
+    """Commands to a browser and its answers: JSON that a zero byte ends."""
+
+    def __init__(self, process: subprocess.Popen[bytes], commands: int, answers: int, wait_s: float):
+        self._process, self._commands, self._answers, self._wait_s = process, commands, answers, wait_s
+        self._number, self._read = 0, b""
+        self._until = time.monotonic() + wait_s
+
+    def check(self) -> None:
+        """Raises RuntimeError where the time to load is over."""
+        if time.monotonic() > self._until:
+            raise RuntimeError(f"the page is not there after {self._wait_s:g} s")
+
+    def ask(self, method: str, session: str | None, **parameters: Any) -> dict[str, Any]:
+        """The answer to a command. Events that come meanwhile are dropped."""
+        self._number += 1
+        command = {"id": self._number, "method": method, "params": parameters} | ({"sessionId": session} if session else {})
+        left = memoryview(json.dumps(command).encode() + b"\0")
+        with contextlib.suppress(BrokenPipeError):  # it has ended: no answer will come, and that says more
+            while left:
+                left = left[os.write(self._commands, left) :]
+        while True:
+            answer = self._message()
+            if answer.get("id") == self._number:
+                if "error" in answer:
+                    raise RuntimeError(f"the browser refuses {method}: {answer['error']['message']}")
+                return answer["result"]
+
+    def _message(self) -> dict[str, Any]:
+        while b"\0" not in self._read:
+            if not select.select([self._answers], [], [], self._wait_s)[0]:
+                raise RuntimeError(f"the browser has said nothing for {self._wait_s:g} s")
+            data = os.read(self._answers, 1 << 20)
+            if not data:
+                raise RuntimeError(f"the browser has ended with status {self._process.wait()}")
+            self._read += data
+        message, _, self._read = self._read.partition(b"\0")
+        return json.loads(message)
+
+
+@contextlib.contextmanager
+def _devtools(browser: str, wait_s: float) -> Iterator[_DevTools]:
+    """A browser that runs. It reads commands from its descriptor 3 and writes answers to 4."""
+    theirs_in, commands = os.pipe()
+    answers, theirs_out = os.pipe()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        words = [browser, *SOFTWARE, f"--user-data-dir={profile}", "--remote-debugging-pipe", "about:blank"]
         process = subprocess.Popen(
-            [browser, *SOFTWARE, f"--user-data-dir={profile}", "--remote-debugging-port=0", address],
+            ["/bin/sh", "-c", f'exec "$0" "$@" 3</dev/fd/{theirs_in} 4>/dev/fd/{theirs_out}', *words],
+            pass_fds=(theirs_in, theirs_out),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
+        os.close(theirs_in)
+        os.close(theirs_out)
         try:
-            images = []
-            while True:
-                name, body = answers.get(timeout=wait_s)
-                if name == "error":
-                    raise RuntimeError(f"the page fails: {body.decode()}")
-                if name == "times":
-                    return images, json.loads(body)
-                images.append(np.array(Image.open(io.BytesIO(body)).convert("RGB")))
-        except queue.Empty:
-            raise RuntimeError(f"{browser} has said nothing for {wait_s:g} s") from None
+            yield _DevTools(process, commands, answers, wait_s)
         finally:
             process.kill()
             process.wait()
-            server.shutdown()
-            server.server_close()
-            serving.join()
+            os.close(commands)
+            os.close(answers)

@@ -188,7 +188,8 @@ class Viewer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  goTo(index) {
+  goTo(index) { // a drive ends there
+    this.setDriving(false);
     this.frame = (index + this.scene.frames.length) % this.scene.frames.length;
     const frame = this.scene.frames[this.frame];
     this.pose = poseOf(frame);
@@ -226,7 +227,10 @@ class Viewer {
     this.pose = { eye: mix("eye"), back, right, up: cross(back, right) };
   }
 
-  startDriving() {
+  setDriving(on) {
+    element("drive").setAttribute("aria-pressed", String(on));
+    this.driving = null;
+    if (!on) return;
     const path = this.scene.frames.filter((frame) => frame.trajectory === this.scene.frames[0].trajectory).map(poseOf);
     const gaps = path.slice(1).map((pose, i) => Math.hypot(...add(pose.eye, path[i].eye, -1)));
     this.driving = { at: 0, spacing: gaps.length ? gaps.reduce((a, b) => a + b) / gaps.length : 1 };
@@ -276,7 +280,7 @@ function controls(viewer) {
     labels.forEach((label, index) => list.add(new Option(label, String(index))));
     list.onchange = () => change(Number(list.value));
   };
-  choice("frames", scene.frames.map((frame) => `${frame.name} (${frame.split})`), (index) => { viewer.driving = null; viewer.goTo(index); });
+  choice("frames", scene.frames.map((frame) => `${frame.name} (${frame.split})`), (index) => viewer.goTo(index));
   choice("mode", ["full image", "mesh only", "skyboxes only", "opacity", "UV charts", "code indices"], (index) => { viewer.mode = index; });
   choice("skybox", ["all skyboxes", ...scene.skyboxes.half_sizes.map((half, i) => `skybox ${i + 1}, ${Math.round(Math.min(...half) / scene.metre)} m`)],
     (index) => { viewer.skybox = index - 1; });
@@ -298,11 +302,7 @@ function controls(viewer) {
     for (const id of ["photo", "split"]) element(id).hidden = !event.target.checked;
     if (event.target.checked) viewer.goTo(viewer.frame);
   };
-  element("drive").onclick = (event) => {
-    if (viewer.driving) viewer.driving = null;
-    else viewer.startDriving();
-    event.currentTarget.setAttribute("aria-pressed", String(Boolean(viewer.driving)));
-  };
+  element("drive").onclick = () => viewer.setDriving(!viewer.driving);
   let held = null;
   canvas.onpointerdown = (event) => { held = [event.clientX, event.clientY]; canvas.setPointerCapture(event.pointerId); canvas.focus(); };
   canvas.onpointermove = (event) => {
