@@ -20,7 +20,7 @@ from model.neuras.baked import Baked
 from model.neuras.maps import Maps, blocks, voxels
 from model.neuras.quantization import clusters, nearest
 from model.neuras.rays import Batch, Pixels
-from model.neuras.sampling import bilinear, gather
+from model.neuras.sampling import Pyramid, bilinear, gather
 from model.neuras.shading import ShaderConfig
 
 CHUNK = 1 << 16  # rays at a time where nothing is learned
@@ -65,10 +65,11 @@ class FitConfig:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What the textures lie on. positions: (H, W, 3) float32, world, of the texels that ``inside`` (H, W) bool says a
-    bilinear sample can reach. sky_centre: (3,), sky_half_sizes: (L, 3), float64, world.
+    """What the textures lie on. positions: (h, w, 3) float32, world, of the texels of the pyramid's sheet that ``inside`` (h, w)
+    bool says a sample can reach. sky_centre: (3,), sky_half_sizes: (L, 3), float64, world.
     """
 
+    pyramid: Pyramid
     positions: np.ndarray
     inside: np.ndarray
     sky_centre: np.ndarray
@@ -80,7 +81,7 @@ class Scene:
 
     def __init__(self, config: FitConfig, surroundings: Surroundings, pixels: Pixels):
         self.config, self.surroundings = config, surroundings
-        self.height, self.width = surroundings.inside.shape
+        self.pyramid = surroundings.pyramid
         self.layers = len(surroundings.sky_half_sizes)
         self.device = pixels.uv.device
         self.half = torch.from_numpy(surroundings.sky_half_sizes.astype(np.float32)).to(self.device)
@@ -100,7 +101,7 @@ class Scene:
     def _start(self, pixels: Pixels) -> dict[str, Maps]:
         """Maps of the texels that training rays touch, their features started from the mean colours of those rays."""
         side, channels = self.config.sky_side, self.config.shader.channels
-        totals = {"mesh": self.height * self.width, "sky": self.layers * 6 * side * side}
+        totals = {"mesh": math.prod(self.pyramid.sheet), "sky": self.layers * 6 * side * side}
         sums = {name: torch.zeros(total, 4, device=self.device) for name, total in totals.items()}
         for batch in pixels.everything(CHUNK):
             for name, (texels, weights, rays) in self.places(batch).items():
@@ -136,12 +137,12 @@ class Scene:
         return [blocks(self.layers, side, edge) for edge in edges if edge < 4 * side]
 
     def places(self, batch: Batch) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-        """Of mesh and sky: texels (N, 4), weights (N, 4), and the number in the batch of each sample's ray (N,).
+        """Of mesh and sky: texels (N, K), weights (N, K), and the number in the batch of each sample's ray (N,).
 
         Pixels that do not count have no samples. The sky's are those of rays that miss the mesh, ray after ray, near to far.
         """
         rays = torch.nonzero(batch.hit & batch.counts)[:, 0]
-        found = {"mesh": (*bilinear(batch.uv[rays], self.width, self.height), rays)}
+        found = {"mesh": (*self.pyramid.sample(batch.uv[rays], batch.detail[rays]), rays)}
         rays = torch.nonzero(~batch.hit & batch.counts)[:, 0]
         side, origins, directions = self.config.sky_side, batch.origins[rays], batch.directions[rays]
         texels, weights = [], []
@@ -189,7 +190,7 @@ class Scene:
     def baked(self, meta: dict[str, Any]) -> Baked:
         """The finished scene, unseen texels filled."""
         side, shader = self.config.sky_side, self.config.shader
-        shapes = {"mesh": (self.height, self.width), "sky": (self.layers, 6, side, side)}
+        shapes = {"mesh": self.pyramid.sheet, "sky": (self.layers, 6, side, side)}
         arrays = {}
         for name, maps in self.maps.items():
             values, row_of = maps.features_of_all(), maps.row_of.cpu().numpy()
@@ -209,6 +210,7 @@ class Scene:
             sky_centre=np.asarray(self.surroundings.sky_centre, np.float64),
             sky_half_sizes=np.asarray(self.surroundings.sky_half_sizes, np.float64),
             view_dependent=shader.view_direction and shader.layers > 0,
+            levels=self.pyramid.levels,
             meta=meta,
             **arrays,
         )

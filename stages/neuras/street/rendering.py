@@ -105,7 +105,7 @@ def _sensor(mi: Any, camera: Camera) -> Any:
                 "type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgb",
                 "rfilter": {"type": "box"},
             },
-            "sampler": {"type": "independent"},
+            "sampler": {"type": "multijitter"},
         }
     )  # fmt: skip
 
