@@ -18,12 +18,12 @@ from safetensors.numpy import load_file, save_file
 from torch import Tensor
 
 from model.errors import InputError
-from model.neuras.sampling import bilinear, gather
+from model.neuras.sampling import Pyramid, bilinear, gather
 from model.neuras.skyboxes import intersect
 from pipeline.atomic import atomic_path, write_atomic
 
 ARRAYS, VALUES = "model.safetensors", "model.json"
-FORMAT = 1  # of the two files
+FORMAT = 2  # of the two files
 Layer = tuple[np.ndarray, np.ndarray]  # weight (out, in) float32, bias (out,) float32
 
 
@@ -31,7 +31,7 @@ Layer = tuple[np.ndarray, np.ndarray]  # weight (out, in) float32, bias (out,) f
 class Baked:
     """A fitted scene. D: channels of a feature, K: codes, L: skyboxes near to far, S: texels along a skybox face.
 
-    mesh_indices (H, W) and sky_indices (L, 6, S, S): uint16, the code of each texel; None without quantization.
+    mesh_indices (H, W), a sheet of the ``levels`` of a ``Pyramid``, and sky_indices (L, 6, S, S): uint16, the code of each texel; None without quantization.
     mesh_features (H, W, D) and sky_features (L, 6, S, S, D): float16, instead of them; None with quantization.
     mesh_codebook, sky_codebook: (K, D) float32; None without quantization.
     mesh_mlp, sky_mlp: layers as (weight (out, in), bias (out,)) float32, see ``render``; no layers: the feature's first
@@ -46,6 +46,7 @@ class Baked:
     sky_centre: np.ndarray
     sky_half_sizes: np.ndarray
     view_dependent: bool
+    levels: int = 1
     mesh_indices: np.ndarray | None = None
     sky_indices: np.ndarray | None = None
     mesh_codebook: np.ndarray | None = None
@@ -65,8 +66,14 @@ class Baked:
 
     @property
     def mesh_size(self) -> tuple[int, int]:
-        """Height and width of the mesh's texture."""
+        """Height and width of the mesh's sheet, all levels."""
         return (self.mesh_indices if self.quantized else self.mesh_features).shape[:2]
+
+    @property
+    def pyramid(self) -> Pyramid:
+        """How the levels lie in the mesh's sheet."""
+        height, width = self.mesh_size
+        return Pyramid(width * 2 // 3 if self.levels > 1 else width, height, self.levels)
 
     @property
     def sky_size(self) -> tuple[int, int]:
@@ -75,7 +82,7 @@ class Baked:
         return maps.shape[0], maps.shape[2]
 
     def mesh_texture(self) -> np.ndarray:
-        """(H, W, D) float32 features of the texels."""
+        """(H, W, D) float32 features of the sheet's texels."""
         return self.mesh_codebook[self.mesh_indices] if self.quantized else self.mesh_features.astype(np.float32)
 
     def sky_textures(self) -> np.ndarray:
@@ -92,6 +99,7 @@ class Baked:
         values = {
             "format": FORMAT,
             "view_dependent": self.view_dependent,
+            "levels": self.levels,
             "quantized": self.quantized,
             "activations": self.activations,
             "sizes": {"mesh": list(self.mesh_size), "sky": list(self.sky_size), "channels": self.channels},
@@ -117,7 +125,7 @@ class Baked:
 
             networks = {name: layers(name) for name in ("mesh_mlp", "sky_mlp")}
             opacity = (arrays.pop("sky_opacity.weight"), arrays.pop("sky_opacity.bias"))
-            stated = {name: values[name] for name in ("view_dependent", "activations", "meta")}
+            stated = {name: values[name] for name in ("view_dependent", "levels", "activations", "meta")}
             return cls(sky_opacity=opacity, **networks, **stated, **arrays)
         except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
             if isinstance(error, InputError):
@@ -125,15 +133,16 @@ class Baked:
             raise InputError(f"{folder} holds no fitted scene ({error}): expected {ARRAYS} and {VALUES} of stage fit") from None
 
     def render(
-        self, uv: np.ndarray, hit: np.ndarray, origin: np.ndarray, directions: np.ndarray
+        self, uv: np.ndarray, detail: np.ndarray, hit: np.ndarray, origin: np.ndarray, directions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Colours (N, 3) in [0, 1] and opacities (N, 1 + L), mesh first, of rays from ``origin`` (3,) along ``directions``.
 
-        uv: (N, 2) texture coordinates where the ray meets the mesh; hit: (N,) bool, whether it does; directions: (N, 3)
+        uv: (N, 2) texture coordinates where the ray meets the mesh; detail: (N,) log2 of the texels that its pixel covers side
+        by side there; hit: (N,) bool, whether it does; directions: (N, 3)
         unit vectors. The steps, which a shader repeats:
 
-        1. F = bilinear sample of the map of *features* (indices do not mix): the mesh at uv, each skybox where
-           ``model.neuras.skyboxes.intersect`` says.
+        1. F = sample of the map of *features* (indices do not mix): the mesh at uv, bilinear in two levels and mixed by detail
+           (``Pyramid.sample``), each skybox where ``model.neuras.skyboxes.intersect`` says, bilinear.
         2. Mesh: colour = mesh_mlp([F, d]) with ReLU between layers; opacity = 1 where ``hit``, else 0 (eq. 1 and 2).
         3. Skybox: h = relu(first layer of sky_mlp(F)); opacity = sigmoid(sky_opacity(h)); colour = the other layers of
            sky_mlp of [h, d], ReLU between them. So the opacity does not depend on the view (eq. 3).
@@ -148,9 +157,8 @@ class Baked:
         rgb = torch.zeros(len(rays), 3)
         with torch.no_grad():
             opacity[:, 0] = hit_rays.float()
-            places = torch.from_numpy(np.ascontiguousarray(uv, dtype=np.float32))[hit_rays]
-            height, width = self.mesh_size
-            features = self._sample("mesh", *bilinear(places, width, height))
+            places, covered = (torch.from_numpy(np.ascontiguousarray(x, dtype=np.float32))[hit_rays] for x in (uv, detail))
+            features = self._sample("mesh", *self.pyramid.sample(places, covered))
             rgb[hit_rays] = _colour(self.mesh_mlp, self._with_direction(features, rays[hit_rays]))
             open_rays = rays[~hit_rays]
             seen, light = torch.zeros(len(open_rays), self.sky_size[0]), torch.zeros(len(open_rays), 3)
@@ -178,7 +186,7 @@ class Baked:
         return _colour(self.sky_mlp[1:], self._with_direction(hidden, rays)), opacity
 
     def _sample(self, maps: str, texels: Tensor, weights: Tensor) -> Tensor:
-        """(N, D) features of the maps "mesh" or "sky"; ``texels``: (N, 4) flat indices."""
+        """(N, D) features of the maps "mesh" or "sky"; ``texels``: (N, K) flat indices."""
         used, where = texels.unique(return_inverse=True)
         numbers = used.numpy()
         if self.quantized:

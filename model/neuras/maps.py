@@ -2,7 +2,7 @@
 
 A texel's feature is the sum of its own row and of one row of each coarse level, which all texels in the same cell share: for
 the mesh a voxel of the world, for a skybox a block of its face. So what one texel learns helps those near it. A texel that no
-ray touched has the mean of the touched texels of the smallest cell that holds both.
+ray touched has the mean of the touched texels that *lend*, of the smallest cell that holds both.
 """
 
 from __future__ import annotations
@@ -39,31 +39,40 @@ def _numbered(keys: np.ndarray) -> np.ndarray:
 class Maps:
     """Texels that are learned, and those that follow from them.
 
-    touched: (T,) bool over all texels. cells: (T,) int64 of each level, fine to coarse; the last one gathers whatever is
-    left. shared: how many of them are coarse levels of their own. start: (R, D) features of the touched texels.
+    touched: (T,) bool over all texels. lending: (T,) bool, those whose values others may take. shared: cells (T,) int64 of each
+    coarse level. filling: cells of each size in which untouched texels look for lending ones, small to large; what none of
+    them fills has the mean of all. start: (R, D) features of the touched texels.
 
     ``row_of``: (T,) int32: rows below R are touched texels, rows from R on are means of cells (``features_of_all``).
     """
 
-    def __init__(self, touched: np.ndarray, cells: Sequence[np.ndarray], shared: int, start: Tensor):
+    def __init__(
+        self,
+        touched: np.ndarray,
+        lending: np.ndarray,
+        shared: Sequence[np.ndarray],
+        filling: Sequence[np.ndarray],
+        start: Tensor,
+    ):
         rows, device = np.flatnonzero(touched), start.device
         self.count = len(rows)
         row_of = np.full(len(touched), -1, np.int32)
         row_of[rows] = np.arange(len(rows))
         self.means: list[tuple[Tensor, Tensor]] = []  # of each level: members, and the mean that each adds to
         last = len(rows)
-        for level in [*cells, np.zeros(len(touched), np.int64)]:
+        lenders = np.flatnonzero(lending[rows] if lending[rows].any() else touched[rows])  # rows
+        for level in [*filling, np.zeros(len(touched), np.int64)]:
             open_texels = np.flatnonzero(row_of < 0)
             if not len(open_texels):
                 break
             filled = np.zeros(int(level.max()) + 1, bool)
-            filled[level[rows]] = True
+            filled[level[rows[lenders]]] = True
             able = open_texels[filled[level[open_texels]]]
             wanted, where = np.unique(level[able], return_inverse=True)
             row_of[able] = last + where
             number = np.full(len(filled), -1, np.int64)
             number[wanted] = np.arange(len(wanted))
-            members = np.flatnonzero(number[level[rows]] >= 0)
+            members = lenders[number[level[rows[lenders]]] >= 0]
             means = last - len(rows) + number[level[rows[members]]]
             self.means.append((torch.from_numpy(members).to(device), torch.from_numpy(means).to(device)))
             last += len(wanted)
@@ -71,7 +80,7 @@ class Maps:
         self.row_of = torch.from_numpy(row_of).to(device)
         self.fine = Table(start)
         self.coarse: list[tuple[Tensor, Table]] = []
-        for level in cells[:shared]:
+        for level in shared:
             used, cell = np.unique(level[rows], return_inverse=True)
             zeros = torch.zeros(len(used), start.shape[1], device=device)
             self.coarse.append((torch.from_numpy(cell.reshape(-1)).to(device), Table(zeros)))

@@ -19,12 +19,14 @@ from model.errors import InputError
 @dataclass(frozen=True, eq=False)
 class View:
     """What a camera saw. origin: (3,) float64, world. directions: (H, W, 3) float32 unit vectors. uv: (H, W, 2) float32 where
-    ``hit`` (H, W) bool, the texture coordinates of the mesh. rgb: (H, W, 3) uint8. counts: (H, W) bool, pixels that count.
+    ``hit`` (H, W) bool, the texture coordinates of the mesh. detail: (H, W) float32, log2 of the texels that a pixel covers side by
+    side there. rgb: (H, W, 3) uint8. counts: (H, W) bool, pixels that count.
     """
 
     origin: np.ndarray
     directions: np.ndarray
     uv: np.ndarray
+    detail: np.ndarray
     hit: np.ndarray
     rgb: np.ndarray
     counts: np.ndarray
@@ -34,16 +36,27 @@ class View:
 class Batch:
     """Pixels (B,) in patches of n x n, patch after patch, row after row.
 
-    origins, directions: (B, 3), origins from the skyboxes' centre. uv: (B, 2). hit, counts: (B,) bool. rgb: (B, 3) in [0, 1].
+    origins, directions: (B, 3), origins from the skyboxes' centre. uv: (B, 2). detail: (B,). hit, counts: (B,) bool. open:
+    (B,) bool, neither the pixel nor one around it sees the mesh. rgb: (B, 3) in [0, 1].
     """
 
     origins: Tensor
     directions: Tensor
     uv: Tensor
+    detail: Tensor
     hit: Tensor
     counts: Tensor
+    open: Tensor
     rgb: Tensor
     patch: int
+
+
+def _open(hit: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels that, with their eight neighbours, miss."""
+    padded = np.pad(hit, 1)
+    height, width = hit.shape
+    around = [padded[row : row + height, column : column + width] for row in range(3) for column in range(3)]
+    return ~np.any(around, axis=0)
 
 
 class Pixels:
@@ -63,13 +76,17 @@ class Pixels:
 
         self.origins = torch.from_numpy(np.stack([v.origin - centre for v in views]).astype(np.float32)).to(device)
         self.directions, self.uv, self.rgb = flat("directions"), flat("uv"), flat("rgb")
-        self.hit, self.counts = flat("hit")[:, 0], flat("counts")[:, 0]
+        self.detail, self.hit, self.counts = (flat(name)[:, 0] for name in ("detail", "hit", "counts"))
+        self.open = torch.from_numpy(np.concatenate([_open(view.hit).ravel() for view in views])).to(device)
 
     def batch(self, pixels: Tensor, views: Tensor) -> Batch:
         """``pixels``: (B,) flat numbers, of these ``views`` (B,)."""
         return Batch(
             self.origins[views],
-            *(values.index_select(0, pixels) for values in (self.directions, self.uv, self.hit, self.counts)),
+            *(
+                values.index_select(0, pixels)
+                for values in (self.directions, self.uv, self.detail, self.hit, self.counts, self.open)
+            ),
             self.rgb.index_select(0, pixels).float() / 255,
             self.patch,
         )

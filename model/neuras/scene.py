@@ -21,11 +21,11 @@ from model.neuras.losses import PerceptualNetwork
 from model.neuras.maps import Maps, blocks, voxels
 from model.neuras.quantization import clusters, nearest
 from model.neuras.rays import Batch, Pixels
-from model.neuras.sampling import bilinear, gather
+from model.neuras.sampling import Pyramid, bilinear, gather
 from model.neuras.shading import ShaderConfig
 
 CHUNK = 1 << 16  # rays at a time where nothing is learned
-MEAN_LEVELS = 4  # cells beyond the shared ones, each four times as wide, from which unseen texels are filled
+FILL_LEVELS = 6  # sizes of cells, each four times as wide as the one before, from which unseen texels are filled
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,11 @@ class FitConfig:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What the textures lie on. positions: (H, W, 3) float32, world, of the texels that ``inside`` (H, W) bool says a
-    bilinear sample can reach. sky_centre: (3,), sky_half_sizes: (L, 3), float64, world.
+    """What the textures lie on. positions: (h, w, 3) float32, world, of the texels of the pyramid's sheet that ``inside`` (h, w)
+    bool says a sample can reach. sky_centre: (3,), sky_half_sizes: (L, 3), float64, world.
     """
 
+    pyramid: Pyramid
     positions: np.ndarray
     inside: np.ndarray
     sky_centre: np.ndarray
@@ -83,7 +84,7 @@ class Scene:
 
     def __init__(self, config: FitConfig, surroundings: Surroundings, pixels: Pixels):
         self.config, self.surroundings = config, surroundings
-        self.height, self.width = surroundings.inside.shape
+        self.pyramid = surroundings.pyramid
         self.layers = len(surroundings.sky_half_sizes)
         self.device = pixels.uv.device
         self.half = torch.from_numpy(surroundings.sky_half_sizes.astype(np.float32)).to(self.device)
@@ -103,14 +104,29 @@ class Scene:
     def _start(self, pixels: Pixels) -> dict[str, Maps]:
         """Maps of the texels that training rays touch, their features started from the mean colours of those rays."""
         side, channels = self.config.sky_side, self.config.shader.channels
-        totals = {"mesh": self.height * self.width, "sky": self.layers * 6 * side * side}
+        totals = {"mesh": math.prod(self.pyramid.sheet), "sky": self.layers * 6 * side * side}
         sums = {name: torch.zeros(total, 4, device=self.device) for name, total in totals.items()}
+        lending = {"mesh": torch.ones(totals["mesh"], dtype=torch.bool), "sky": torch.zeros(totals["sky"], dtype=torch.bool)}
         for batch in pixels.everything(CHUNK):
             for name, (texels, weights, rays) in self.places(batch).items():
                 used = weights + 1e-6  # a texel of weight 0 is named too
                 colours = torch.cat([batch.rgb[rays], torch.ones(len(rays), 1, device=self.device)], dim=1)
                 sums[name].index_add_(0, texels.reshape(-1), (used[:, :, None] * colours[:, None, :]).reshape(-1, 4))
-        cells = {"mesh": self._voxels(), "sky": self._blocks()}
+                if name == "sky":  # a ray beside the mesh may see what the mesh lacks: that is no sky to spread
+                    lending[name][texels[batch.open[rays]].reshape(-1).cpu()] = True
+        config, side = self.config, self.config.sky_side
+        shared = [4**level for level in range(config.shared_levels)]
+        filling = [4**level for level in range(FILL_LEVELS)]
+        cells = {
+            "mesh": (
+                [self._voxels(config.voxel * size) for size in shared],
+                [self._voxels(config.voxel / 2 * size) for size in filling],
+            ),
+            "sky": tuple(
+                [blocks(self.layers, side, config.block * k) for k in sizes if config.block * k < 4 * side]
+                for sizes in (shared, filling)
+            ),
+        }
         maps = {}
         for name, total in sums.items():
             touched = total[:, 3] > 0
@@ -120,31 +136,23 @@ class Scene:
                 farthest = torch.nonzero(touched)[:, 0] >= (self.layers - 1) * 6 * side * side
                 near = math.log(self.config.near_opacity / (1 - self.config.near_opacity))
                 start[:, shading.OPACITY] = torch.where(farthest, 4.0, near)
-            maps[name] = Maps(touched.cpu().numpy(), cells[name], self.config.shared_levels, start)
+            maps[name] = Maps(touched.cpu().numpy(), lending[name].numpy(), *cells[name], start)
         return maps
 
-    def _voxels(self) -> list[np.ndarray]:
-        """Cells of the mesh's texels; those that no sample reaches are all in cell 0."""
+    def _voxels(self, edge: float) -> np.ndarray:
+        """(T,) int64: cells of the mesh's texels; those that no sample reaches are all in cell 0."""
         inside = self.surroundings.inside.reshape(-1)
-        found = []
-        for level in range(self.config.shared_levels + MEAN_LEVELS):
-            cells = np.zeros(len(inside), np.int64)
-            cells[inside] = voxels(self.surroundings.positions.reshape(-1, 3)[inside], self.config.voxel * 4**level)
-            found.append(cells)
-        return found
-
-    def _blocks(self) -> list[np.ndarray]:
-        edges = [self.config.block * 4**level for level in range(self.config.shared_levels + MEAN_LEVELS)]
-        side = self.config.sky_side
-        return [blocks(self.layers, side, edge) for edge in edges if edge < 4 * side]
+        cells = np.zeros(len(inside), np.int64)
+        cells[inside] = voxels(self.surroundings.positions.reshape(-1, 3)[inside], edge)
+        return cells
 
     def places(self, batch: Batch) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-        """Of mesh and sky: texels (N, 4), weights (N, 4), and the number in the batch of each sample's ray (N,).
+        """Of mesh and sky: texels (N, K), weights (N, K), and the number in the batch of each sample's ray (N,).
 
         Pixels that do not count have no samples. The sky's are those of rays that miss the mesh, ray after ray, near to far.
         """
         rays = torch.nonzero(batch.hit & batch.counts)[:, 0]
-        found = {"mesh": (*bilinear(batch.uv[rays], self.width, self.height), rays)}
+        found = {"mesh": (*self.pyramid.sample(batch.uv[rays], batch.detail[rays]), rays)}
         rays = torch.nonzero(~batch.hit & batch.counts)[:, 0]
         side, origins, directions = self.config.sky_side, batch.origins[rays], batch.directions[rays]
         texels, weights = [], []
@@ -192,7 +200,7 @@ class Scene:
     def baked(self, meta: dict[str, Any]) -> Baked:
         """The finished scene, unseen texels filled."""
         side, shader = self.config.sky_side, self.config.shader
-        shapes = {"mesh": (self.height, self.width), "sky": (self.layers, 6, side, side)}
+        shapes = {"mesh": self.pyramid.sheet, "sky": (self.layers, 6, side, side)}
         arrays = {}
         for name, maps in self.maps.items():
             values, row_of = maps.features_of_all(), maps.row_of.cpu().numpy()
@@ -212,6 +220,7 @@ class Scene:
             sky_centre=np.asarray(self.surroundings.sky_centre, np.float64),
             sky_half_sizes=np.asarray(self.surroundings.sky_half_sizes, np.float64),
             view_dependent=shader.view_direction and shader.layers > 0,
+            levels=self.pyramid.levels,
             meta=meta,
             **arrays,
         )

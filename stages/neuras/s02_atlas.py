@@ -29,7 +29,7 @@ PLAN = "densities.json"
 class AtlasConfig(StageConfig):
     """Texels per pixel: how many texels stand side by side where a training image has one pixel."""
 
-    texels_per_pixel: float = Field(0.6, gt=0, le=8)  # of a tile, against the finer quarter of its pixels
+    texels_per_pixel: float = Field(1.0, gt=0, le=8)  # of a tile, against the finer quarter of its pixels
     texels_per_metre: float | None = Field(None, gt=0)  # one density for all, in place of it
     size: int | None = Field(None, ge=64, le=16384)  # a square texture of this side, in place of both
     max_megatexels: float = Field(4.0, gt=0, le=256)  # of the surface; densities are lowered to fit

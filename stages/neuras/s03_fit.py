@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from stages.neuras.records import AtlasMesh, CaptureInfo, FrameRecord
 
 VGG_LEAST = 16  # pixels along a patch: VGG16 halves it four times
-REACH = 3.0  # texels around a chart that a bilinear sample may read
+REACH = 3.0  # texels of a level around a chart that a sample may read
 
 
 class FitStageConfig(StageConfig):
@@ -43,6 +43,7 @@ class FitStageConfig(StageConfig):
     view_direction: bool = True  # the networks read it
     codes: int = Field(1024, ge=0, le=65536)  # K of each codebook; 0: no quantization
     skyboxes: int = Field(6, ge=1, le=16)  # L
+    texture_levels: int = Field(3, ge=1, le=5)  # of the mesh's texture, each half as wide and high; 1: the paper's
     sky_side: int = Field(256, ge=8, le=8192)  # texels along a face of a skybox
     sky_near_m: float = Field(150.0, gt=0)  # half size of the nearest skybox
     sky_far_m: float = Field(2400.0, gt=0)
@@ -50,7 +51,7 @@ class FitStageConfig(StageConfig):
     steps: int = Field(900, ge=1)
     patch: int = Field(8, ge=2)  # pixels along a patch
     patches: int = Field(128, ge=1)  # of a step
-    lr: float = Field(0.01, gt=0)  # of textures and codes
+    lr: float = Field(0.003, gt=0)  # of textures and codes
     network_lr: float = Field(0.003, gt=0)
     final_lr: float = Field(0.1, ge=0, le=1)  # share of both at the end of the cosine
     vq: float = Field(0.1, ge=0)  # lambda_vq
@@ -158,10 +159,12 @@ def _view(frame: FrameRecord, atlas: AtlasMesh, caster: Any) -> View:
     import numpy as np
 
     from model.neuras.rays import View
+    from stages.neuras.rasterizing.footprints import detail
 
     seen = caster.view(frame.camera)
     return View(
         origin=frame.camera.position,
+        detail=detail(seen, frame.camera, atlas),
         directions=frame.camera.directions().astype(np.float32),
         uv=seen.interpolate(atlas.faces, atlas.uvs),
         hit=seen.hit,
@@ -174,20 +177,24 @@ def _surroundings(config: FitStageConfig, info: CaptureInfo, atlas: AtlasMesh, c
     """Where texels lie in the world, and the skyboxes around the box of mesh and cameras."""
     import numpy as np
 
-    from model.neuras.fitting import Surroundings
+    from model.errors import InputError
+    from model.neuras.sampling import Pyramid
+    from model.neuras.scene import Surroundings
     from model.neuras.skyboxes import half_sizes
-    from stages.neuras.rasterizing.texels import texels
+    from stages.neuras.rasterizing.texels import sheet
 
-    drawn = texels(atlas)
-    face, weights = (values.reshape(-1, *values.shape[2:])[drawn.nearest] for values in (drawn.face, drawn.barycentric))
-    second, third = weights[..., :1], weights[..., 1:]
-    a, b, c = (atlas.vertices[atlas.faces[:, corner]][face] for corner in range(3))
+    try:
+        pyramid = Pyramid(atlas.width, atlas.height, config.texture_levels)
+    except InputError as error:
+        raise UserError(f"{error}; set fit.texture_levels=1, or another atlas.size") from None
+    positions, inside = sheet(atlas, pyramid, REACH)
     everything = np.concatenate([atlas.vertices, np.array(cameras)])
     low, high = everything.min(axis=0), everything.max(axis=0)
     near, far = config.sky_near_m * info.metre, config.sky_far_m * info.metre
     return Surroundings(
-        positions=(a * (1 - second - third) + b * second + c * third).astype(np.float32),
-        inside=drawn.distance <= REACH,
+        pyramid=pyramid,
+        positions=positions,
+        inside=inside,
         sky_centre=((low + high) / 2).astype(np.float64),
         sky_half_sizes=half_sizes((high - low) / 2, near, far, config.skyboxes),
     )

@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 
 from model.neuras.baked import Baked
+from model.neuras.sampling import Pyramid
 from model.neuras.skyboxes import half_sizes
 from stages.graphics.cameras import Camera
 from stages.neuras.records import AtlasMesh, Mesh
@@ -25,6 +26,7 @@ def baked(
     view_dependent: bool = True,
     networks: bool = True,
     channels: int = 12,
+    levels: int = 3,
     seed: int = 0,
 ) -> Baked:
     """Smooth maps of random codes, so that bilinear samples matter, and networks whose colours stay in range."""
@@ -50,7 +52,7 @@ def baked(
     maps = {
         "mesh_codebook": rng.normal(0.5, 0.5, (64, channels)).astype(np.float32),
         "sky_codebook": rng.normal(0.5, 0.5, (64, channels)).astype(np.float32),
-        "mesh_indices": rng.integers(0, 64, (flat.height, flat.width)).astype(np.uint16),
+        "mesh_indices": rng.integers(0, 64, Pyramid(flat.width, flat.height, levels).sheet).astype(np.uint16),
         "sky_indices": rng.integers(0, 64, (layers, 6, side, side)).astype(np.uint16),
     }
     if not quantized:
@@ -65,6 +67,7 @@ def baked(
         sky_centre=np.array(centre, float),
         sky_half_sizes=half_sizes(np.full(3, 4.0), 20.0, 200.0, layers),
         view_dependent=view_dependent,
+        levels=levels,
         **maps,
     )
 

@@ -16,6 +16,7 @@ from stages.graphics.cameras import Camera
 from stages.neuras.baking import browser, drawing, shaders
 from stages.neuras.baking.site import PAGE, write_site
 from stages.neuras.rasterizing.casting import Caster
+from stages.neuras.rasterizing.footprints import detail
 from stages.neuras.records import AtlasMesh, CaptureInfo, FrameRecord
 from tests.neuras import scenes
 
@@ -32,13 +33,22 @@ def reference(baked: Baked, atlas: AtlasMesh, camera: Camera) -> tuple[np.ndarra
     """(H, W, 3) colours and (H, W) hits as torch computes them."""
     view = Caster(atlas.vertices, atlas.faces).view(camera)
     uv = view.interpolate(atlas.faces, atlas.uvs).reshape(-1, 2)
-    rgb, _ = baked.render(uv, view.hit.ravel(), camera.position, camera.directions().reshape(-1, 3))
+    covered = detail(view, camera, atlas).ravel()
+    rgb, _ = baked.render(uv, covered, view.hit.ravel(), camera.position, camera.directions().reshape(-1, 3))
     return rgb.reshape(camera.height, camera.width, 3), view.hit
 
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"quantized": False}, {"view_dependent": False}, {"networks": False}, {"channels": 6}, {"centre": (5e5, -4e6, 30.0)}],
+    [
+        {},
+        {"quantized": False},
+        {"view_dependent": False},
+        {"networks": False},
+        {"channels": 6},
+        {"levels": 1},
+        {"centre": (5e5, -4e6, 30.0)},
+    ],
     ids=lambda settings: "-".join(settings) or "default",
 )
 def test_opengl_draws_what_torch_computes(settings):

@@ -13,6 +13,7 @@ from PIL import Image
 from pydantic import ValidationError
 
 from model.neuras.baked import Baked
+from model.neuras.sampling import Pyramid
 from model.weights import VGG16
 from pipeline.errors import UserError
 from pipeline.plan import plan_stage
@@ -22,6 +23,7 @@ from stages.graphics.arrays import pack_json
 from stages.graphics.cameras import Camera
 from stages.graphics.page import png
 from stages.neuras.rasterizing.casting import Caster
+from stages.neuras.rasterizing.footprints import detail
 from stages.neuras.records import FRAME, CaptureInfo, FrameRecord, save
 from stages.neuras.s03_fit import Fit, FitStageConfig
 from tests.model.lpips import write_weights
@@ -94,7 +96,7 @@ def test_files_of_a_fit(tmp_path, inputs):
     assert sorted(products) == ["model.json", "model.safetensors"]
     baked = Baked.load(made.files)
     flat = scenes.atlas()
-    assert baked.mesh_size == (flat.height, flat.width) and baked.sky_size == (3, 16)
+    assert baked.mesh_size == Pyramid(flat.width, flat.height, 3).sheet and baked.sky_size == (3, 16)
     assert (baked.sky_half_sizes[0] >= 20).all() and (baked.sky_half_sizes[-1] >= 80).all()
     assert made.summary["fitting"]["psnr"] > 24
     curve = (made.files / "curve.csv").read_text().splitlines()
@@ -109,7 +111,8 @@ def test_the_unseen_frame_is_rendered_well(tmp_path, inputs):
     baked, flat, unseen = Baked.load(run(tmp_path, inputs)[0].files), scenes.atlas(), frame(5, "test", scenes.atlas())
     seen = Caster(flat.vertices, flat.faces).view(unseen.camera)
     uv, directions = seen.interpolate(flat.faces, flat.uvs).reshape(-1, 2), unseen.camera.directions().reshape(-1, 3)
-    rgb, _ = baked.render(uv, seen.hit.ravel(), unseen.camera.position, directions)
+    covered = detail(seen, unseen.camera, flat).ravel()
+    rgb, _ = baked.render(uv, covered, seen.hit.ravel(), unseen.camera.position, directions)
     truth = unseen.image() / 255
     assert -10 * np.log10(np.square(rgb.reshape(truth.shape) - truth).mean()) > 24
     assert -10 * np.log10(np.square(truth.mean(axis=(0, 1)) - truth).mean()) < 15

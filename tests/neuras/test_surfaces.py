@@ -8,9 +8,11 @@ import trimesh
 
 from stages.graphics.cameras import Camera
 from stages.neuras.rasterizing.casting import Caster
-from stages.neuras.rasterizing.texels import texels
+from stages.neuras.rasterizing.footprints import detail
+from stages.neuras.rasterizing.texels import sheet, texels
 from stages.neuras.records import Mesh
 from stages.neuras.surfaces import reconstruct, simplify, unfold, visibility
+from tests.neuras import scenes
 
 
 def sphere(subdivisions: int = 3, radius: float = 2.0) -> Mesh:
@@ -196,3 +198,43 @@ def test_tiles_do_not_overlap_in_the_texture(atlas):
     same = drawn.face[row, column] == np.arange(len(flat.faces))
     neighbours = flat.charts[drawn.face[row, column]] == flat.charts
     assert (same | neighbours).all()
+
+
+def test_detail_is_the_area_that_neighbouring_rays_cut_out():
+    """Against the definition: texture coordinates half a pixel to each side, on the plane of the face."""
+    atlas, camera = scenes.atlas(), scenes.looking_at((4.0, 3.0, 2.0))
+    view = Caster(atlas.vertices, atlas.faces).view(camera)
+    ours = detail(view, camera, atlas)
+    centres, size = camera.pixel_centres(), np.array([atlas.width, atlas.height])
+    corners = atlas.vertices[atlas.faces].astype(float)
+    for row, column in np.argwhere(view.hit)[::37]:
+        a, b, c = corners[view.face[row, column]]
+        flat = atlas.uvs[atlas.faces[view.face[row, column]]] * size
+
+        def place(offset, a=a, b=b, c=c, flat=flat, row=row, column=column):
+            ray = camera.directions(centres[row, column] + offset)
+            s, t, _ = np.linalg.solve(np.stack([b - a, c - a, -ray], axis=1), camera.position - a)
+            return flat[0] + s * (flat[1] - flat[0]) + t * (flat[2] - flat[0])
+
+        across = place((1e-3, 0)) - place((-1e-3, 0))
+        down = place((0, 1e-3)) - place((0, -1e-3))
+        area = abs(across[0] * down[1] - across[1] * down[0]) / 4e-6
+        assert ours[row, column] == pytest.approx(0.5 * np.log2(area), abs=1e-3)
+    assert (ours[~view.hit] == 0).all() and view.hit.any()
+
+
+def test_a_coarse_texel_lies_amid_the_finer_ones():
+    from model.neuras.sampling import Pyramid
+
+    atlas = scenes.atlas()
+    pyramid = Pyramid(atlas.width, atlas.height, 3)
+    positions, inside = sheet(atlas, pyramid, 1.5)
+    assert positions.shape == (*pyramid.sheet, 3) and inside.shape == pyramid.sheet
+    fine = texels(atlas)
+    for level in (1, 2):
+        (row, column), (height, width) = pyramid.corner(level), pyramid.size(level)
+        place = np.s_[row : row + height, column : column + width]
+        whole = (fine.face >= 0).reshape(height, 1 << level, width, 1 << level).all(axis=(1, 3))
+        assert whole.sum() > 20 and inside[place][whole].all() and not inside[place].all()
+        means = positions[: atlas.height, : atlas.width].reshape(height, 1 << level, width, 1 << level, 3).mean(axis=(1, 3))
+        assert np.abs(positions[place] - means)[whole].max() < 1e-5

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.neuras.baked import Baked, Layer
+from model.neuras.sampling import Pyramid
 
 DIALECTS = {
     "desktop": "#version 330\n",
@@ -93,25 +94,26 @@ def mesh_shaders(baked: Baked, dialect: str, ranges: Ranges | None) -> tuple[str
     """Vertex and fragment shader of the mesh. ``ranges``: None where textures hold features themselves (half floats)."""
     count = textures(baked.channels)
     samplers = "".join(f"uniform sampler2D mesh{i};\n" for i in range(count))
-    features = "".join(f"    vec4 f{i} = {_texel(f'texture(mesh{i}, place)', ranges, i)};\n" for i in range(count))
+    features = "".join(f"    vec4 f{i} = {_texel(_levels(baked.pyramid, f'mesh{i}'), ranges, i)};\n" for i in range(count))
     body = f"""
 in vec2 place;
 in vec3 ray;
 flat in float chart_number;
 out vec4 colour;
 uniform int mode;
+uniform float pixel;  // area of a pixel at distance 1: 1 / (fx fy), focal lengths in pixels
 uniform usampler2D codes;
-{samplers}{COLOURS}
+{samplers}{COLOURS}{_pyramid(baked.pyramid)}
 {_network("mesh_colour", baked.mesh_mlp, count, baked.channels, baked.view_dependent)}
 void main() {{
     if (mode == 2) discard;
     if (mode == 3) {{ colour = vec4(1.0); return; }}
     if (mode == 4) {{ colour = vec4(number_colour(chart_number), 1.0); return; }}
     if (mode == 5) {{
-        colour = vec4(number_colour(float(texelFetch(codes, ivec2(place * vec2(textureSize(codes, 0))), 0).r)), 1.0);
+        colour = vec4(number_colour(float(texelFetch(codes, ivec2(place * texture_size), 0).r)), 1.0);
         return;
     }}
-{features}    colour = vec4(clamp(mesh_colour({_features(count)}, normalize(ray)), 0.0, 1.0), 1.0);
+{_detail(baked.pyramid)}{features}    colour = vec4(clamp(mesh_colour({_features(count)}, normalize(ray)), 0.0, 1.0), 1.0);
 }}
 """
     return DIALECTS[dialect] + MESH_VERTEX, DIALECTS[dialect] + body
@@ -168,6 +170,50 @@ void main() {{
 }}
 """
     return DIALECTS[dialect] + SKY_VERTEX, DIALECTS[dialect] + body
+
+
+def _pyramid(pyramid: Pyramid) -> str:
+    """Constants and functions that look up a level of the mesh's sheet; ``Pyramid.sample`` in GLSL."""
+    height, width = pyramid.sheet
+    corners = ", ".join(f"vec2({column}.0, {row}.0)" for row, column in map(pyramid.corner, range(pyramid.levels)))
+    text = f"const vec2 texture_size = vec2({pyramid.width}.0, {pyramid.height}.0);\n"
+    if pyramid.levels == 1:
+        return text
+    return f"""{text}const vec2 sheet_size = vec2({width}.0, {height}.0);
+const vec2 corners[{pyramid.levels}] = vec2[{pyramid.levels}]({corners});
+vec2 in_sheet(int level) {{  // where a level of the sheet has this place, half a texel from the level's border at least
+    vec2 size = texture_size / exp2(float(level));
+    return (corners[level] + clamp(place * size, vec2(0.5), size - 0.5)) / sheet_size;
+}}
+"""
+
+
+def _detail(pyramid: Pyramid) -> str:
+    """Statements: the two levels whose texels are as large as the pixel, and the coarser one's share.
+
+    ``dFdx`` and ``dFdy`` are differences over two pixels, but all of them lie on one plane: texels and area change alike, and
+    the ratio of the two is exact. So this equals ``stages.neuras.rasterizing.footprints.detail``.
+    """
+    if pyramid.levels == 1:
+        return ""
+    return f"""    vec2 across = dFdx(place) * texture_size;
+    vec2 down = dFdy(place) * texture_size;
+    float depth = 1.0 / gl_FragCoord.w;
+    float facing = abs(dot(cross(dFdx(ray), dFdy(ray)), ray));
+    float texels = abs(across.x * down.y - across.y * down.x) * pixel * depth * depth * depth / max(facing, 1e-20);
+    float detail = clamp(0.5 * log2(max(texels, 1e-12)), 0.0, {pyramid.levels - 1}.0);
+    int finer = min(int(detail), {pyramid.levels - 2});
+    float share = detail - float(finer);
+    vec2 fine = in_sheet(finer);
+    vec2 coarse = in_sheet(finer + 1);
+"""
+
+
+def _levels(pyramid: Pyramid, sampler: str) -> str:
+    """The features of the mesh."""
+    if pyramid.levels == 1:
+        return f"texture({sampler}, place)"
+    return f"mix(texture({sampler}, fine), texture({sampler}, coarse), share)"
 
 
 def _texel(sample: str, ranges: Ranges | None, index: int) -> str:

@@ -4,7 +4,8 @@
 index.html, *.js   the page; no build step, no network
 scene.json         sizes, formats, skyboxes, cameras of the frames, shaders' names
 geometry.glb       the mesh: POSITION relative to the skyboxes' centre, TEXCOORD_0 (v down), _CHART
-mesh_codes.png     code of each texel: low byte in R, high byte in G (quantized scenes)
+mesh_codes.png     code of each texel: low byte in R, high byte in G (quantized scenes). Level 0 of the texture lies on the
+                   left, coarser levels one below the other on its right
 sky_codes.png      the same of the skyboxes: a row of six faces for each, the nearest on top
 codebooks.bin      float32: mesh codes (K, D), then sky codes (K, D)
 mesh_I.png, ...    features of scenes without quantization: bytes in RGBA, four channels each (``ranges`` in scene.json)
@@ -76,7 +77,7 @@ def write_site(
         "quantized": baked.quantized,
         "expand": "rgba8" if bytes_wanted else "fp16",
         "ranges": {name: None if r is None else {"low": r.low.tolist(), "span": r.span.tolist()} for name, r in ranges.items()},
-        "mesh": {"width": atlas.width, "height": atlas.height, "faces": len(atlas.faces)},
+        "mesh": {"width": baked.mesh_size[1], "height": baked.mesh_size[0], "levels": baked.levels, "faces": len(atlas.faces)},
         "skyboxes": {"count": layers, "side": side, "half_sizes": baked.sky_half_sizes.tolist()},
         "codes": {name: len(book) for name, book in (("mesh", baked.mesh_codebook), ("sky", baked.sky_codebook))}
         if baked.quantized

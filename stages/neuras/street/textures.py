@@ -81,8 +81,8 @@ def _weathered(rng: np.random.Generator, colours: np.ndarray, stains: float = 1.
     size = len(colours)
     blotches = fractal(rng, size, 1, 12, 1.4)
     streaks = np.maximum(fractal(rng, size, 4, size / 4, 0.8, stretch=14) - 0.4, 0)
-    grain = fractal(rng, size, 40, size / 2, 0.2)
-    shade = 1 + stains * (0.06 * blotches - 0.09 * streaks) + 0.04 * grain
+    grain = fractal(rng, size, 40, size / 2, 0.6)
+    shade = 1 + stains * (0.06 * blotches - 0.09 * streaks) + 0.025 * grain
     return finished(colours * shade[..., None])
 
 
@@ -106,8 +106,8 @@ def _courses(
 def brick(rng: np.random.Generator, size: int) -> np.ndarray:
     base = hue(rng, (0.0, 0.09), (0.2, 0.55), (0.45, 0.75))
     block, joints = _courses(rng, size, 64, 22, 0.16)
-    colours = base * (0.72 + 0.5 * block[..., None])
-    odd = (block > 0.93)[..., None]
+    colours = base * (0.82 + 0.3 * block[..., None])
+    odd = (block > 0.96)[..., None]
     colours = np.where(odd, base * 0.45, colours)
     return _weathered(rng, np.where(joints[..., None], hue(rng, (0.05, 0.15), (0.02, 0.15), (0.5, 0.85)), colours))
 
@@ -127,7 +127,7 @@ def plaster(rng: np.random.Generator, size: int) -> np.ndarray:
     chips = fractal(rng, size, 3, 90, 1.0) > 2.2
     under = _courses(rng, size, 64, 22, 0.16)[0][..., None] * 0.3 + 0.35
     colours = np.where(chips[..., None], under * np.array([1.0, 0.8, 0.7]), base * np.ones((size, size, 1)))
-    speckle = 1 + 0.045 * fractal(rng, size, 60, size / 2, 0)
+    speckle = 1 + 0.02 * fractal(rng, size, 60, size / 2, 0.4)
     return _weathered(rng, colours * speckle[..., None], 1.1)
 
 
@@ -135,8 +135,8 @@ def stone(rng: np.random.Generator, size: int) -> np.ndarray:
     base = hue(rng, (0.05, 0.16), (0.05, 0.3), (0.5, 0.85))
     block, joints = _courses(rng, size, 18, 9, 0.06)
     vein = np.abs(fractal(rng, size, 6, 120, 1.1))
-    colours = base * (0.75 + 0.4 * block + 0.1 * vein)[..., None]
-    return _weathered(rng, np.where(joints[..., None], base * 0.45, colours), 1.3)
+    colours = base * (0.82 + 0.26 * block + 0.06 * vein)[..., None]
+    return _weathered(rng, np.where(joints[..., None], base * 0.6, colours), 1.1)
 
 
 def panels(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -164,16 +164,16 @@ def tiles(rng: np.random.Generator, size: int) -> np.ndarray:
     )
     block, joints = _courses(rng, size, 32, 40, 0.12)
     v = ((np.arange(size) + 0.5) / size * 32) % 1
-    colours = base * ((0.6 + 0.7 * block) * (0.7 + 0.5 * v)[:, None])[..., None]
+    colours = base * ((0.75 + 0.4 * block) * (0.8 + 0.3 * v)[:, None])[..., None]
     moss = np.clip(fractal(rng, size, 2, 60, 1.0) - 0.8, 0, 1)[..., None]
     colours = colours * (1 - moss) + np.array([0.3, 0.34, 0.18]) * moss
     return _weathered(rng, np.where(joints[..., None], base * 0.3, colours))
 
 
 def asphalt(rng: np.random.Generator, size: int) -> np.ndarray:
-    grey = 0.42 + 0.03 * fractal(rng, size, 1, 10, 1.2) + 0.04 * fractal(rng, size, 40, size / 2, -0.1)
-    stones = fractal(rng, size, size / 6, size / 2, 0) > 2.0
-    grey = np.where(stones, grey + 0.2, grey)
+    grey = 0.42 + 0.03 * fractal(rng, size, 1, 10, 1.2) + 0.02 * fractal(rng, size, 40, size / 2, 0.3)
+    stones = fractal(rng, size, size / 6, size / 2, 0) > 2.4
+    grey = np.where(stones, grey + 0.12, grey)
     cracks = np.abs(fractal(rng, size, 2, 30, 1.3)) < 0.016
     cracks |= np.abs(fractal(rng, size, 3, 50, 1.2)) < 0.012
     grey = np.where(cracks, 0.16, grey)
@@ -191,7 +191,7 @@ def asphalt(rng: np.random.Generator, size: int) -> np.ndarray:
 def slabs(rng: np.random.Generator, size: int) -> np.ndarray:
     """Pavement."""
     block, joints = _courses(rng, size, 12, 8, 0.05, 0.5)
-    grey = 0.5 + 0.14 * (block - 0.5) + 0.03 * fractal(rng, size, 1, 20, 1.1) + 0.045 * fractal(rng, size, 40, size / 2, 0.1)
+    grey = 0.5 + 0.14 * (block - 0.5) + 0.03 * fractal(rng, size, 1, 20, 1.1) + 0.025 * fractal(rng, size, 40, size / 2, 0.4)
     gum = fractal(rng, size, 20, 60, 0.2) > 2.6
     grey = np.where(joints, 0.27, np.where(gum, grey - 0.14, grey))
     return finished(grey[..., None] * (np.array([1.0, 0.97, 0.92]) + 0.03 * (block[..., None] - 0.5)))
@@ -202,11 +202,11 @@ def grass(rng: np.random.Generator, size: int) -> np.ndarray:
     dry = np.clip(0.5 + 0.5 * fractal(rng, size, 1, 12, 1.2), 0, 1)[..., None]
     colours = np.array([0.28, 0.42, 0.16]) * (1 - dry) + np.array([0.42, 0.45, 0.23]) * dry
     flowers = (fractal(rng, size, size / 8, size / 3, 0) > 3.4)[..., None]
-    return finished(np.where(flowers, np.array([0.9, 0.88, 0.6]), colours * (1 + 0.2 * blades[..., None])))
+    return finished(np.where(flowers, np.array([0.9, 0.88, 0.6]), colours * (1 + 0.12 * blades[..., None])))
 
 
 def gravel(rng: np.random.Generator, size: int) -> np.ndarray:
-    grey = 0.52 + 0.12 * fractal(rng, size, 30, size / 3, 0.1) + 0.05 * fractal(rng, size, 1, 8, 1.2)
+    grey = 0.52 + 0.07 * fractal(rng, size, 30, size / 3, 0.3) + 0.05 * fractal(rng, size, 1, 8, 1.2)
     return finished(grey[..., None] * hue(rng, (0.05, 0.12), (0.02, 0.14), (0.85, 1)))
 
 
@@ -253,7 +253,7 @@ def speckled(colour: np.ndarray, amount: float = 0.06) -> Callable[[np.random.Ge
 def leaves(rng: np.random.Generator, size: int) -> np.ndarray:
     """A palette: each leaf samples one spot of it."""
     a, b = hue(rng, (0.2, 0.3), (0.45, 0.7), (0.2, 0.4)), hue(rng, (0.14, 0.27), (0.45, 0.75), (0.45, 0.75))
-    mix = np.clip(0.5 + 0.33 * fractal(rng, size, 4, size / 2, 0.4), 0, 1)[..., None]
+    mix = np.clip(0.5 + 0.22 * fractal(rng, size, 4, size / 2, 0.4), 0, 1)[..., None]
     return finished(a * (1 - mix) + b * mix)
 
 

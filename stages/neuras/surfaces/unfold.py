@@ -73,7 +73,7 @@ def unfold(mesh: Mesh, rows: np.ndarray, texels_per_unit: float, padding: int) -
     )
 
 
-def pack(parts: list[Tile], padding: int, size: int | None = None, multiple: int = 4) -> AtlasMesh:
+def pack(parts: list[Tile], padding: int, size: int | None = None, multiple: int = 16) -> AtlasMesh:
     """One texture of all charts of all tiles, each at its own size: about square, sides multiples of ``multiple``.
 
     With ``size`` the texture is ``size`` x ``size``, and charts that do not fit are made smaller by one factor for all.

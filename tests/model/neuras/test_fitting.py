@@ -14,7 +14,7 @@ from model.neuras import fitting, quantization, shading, skyboxes, tables
 from model.neuras.baked import Baked
 from model.neuras.maps import Maps, blocks, voxels
 from model.neuras.rays import Pixels, View
-from model.neuras.sampling import bilinear, gather
+from model.neuras.sampling import Pyramid, bilinear, gather
 from model.neuras.scene import FitConfig, Scene, Surroundings
 
 
@@ -156,13 +156,25 @@ def test_texels_that_no_ray_touched_have_the_mean_of_their_smallest_cell():
     touched = np.array([True, True, False, False, True, False, False, False])
     cells = [np.array([0, 0, 0, 1, 2, 2, 3, 3]), np.array([0, 0, 0, 0, 0, 0, 1, 1])]
     start = torch.tensor([[1.0], [3.0], [8.0]])
-    maps = Maps(touched, cells, 1, start)
+    maps = Maps(touched, touched, cells[:1], cells, start)
     values = maps.features_of_all()[maps.row_of.long()][:, 0]
     assert values.tolist() == [1, 3, 2, 4, 8, 8, 4, 4]  # cell 0; all of level 1; itself; cell 2; everything
 
 
+def test_texels_take_no_value_from_those_that_do_not_lend():
+    touched = np.array([True, True, False, True, False])
+    start = torch.tensor([[1.0], [3.0], [8.0]])
+    cells = [np.array([0, 0, 0, 1, 1])]
+    values = [
+        maps.features_of_all()[maps.row_of.long()][:, 0].tolist()
+        for lending in ([False, True, True, False, True], [False] * 5)
+        for maps in [Maps(touched, np.array(lending), [], cells, start)]
+    ]
+    assert values == [[1, 3, 3, 8, 3], [1, 3, 2, 8, 8]]  # where none lends, all do
+
+
 def test_a_coarse_level_moves_the_neighbours():
-    maps = Maps(np.array([True, True, True]), [np.array([0, 0, 1])], 1, torch.zeros(3, 2))
+    maps = Maps(np.full(3, True), np.full(3, True), [np.array([0, 0, 1])], [], torch.zeros(3, 2))
     maps.update(torch.tensor([0]), torch.ones(1, 2), lr=0.1, step=1)
     values = maps.features(torch.arange(3))[:, 0]
     assert values.tolist() == pytest.approx([-0.2, -0.1, 0.0], abs=1e-6)
@@ -173,6 +185,34 @@ def test_cells_are_blocks_of_a_face_and_voxels_of_the_world():
     assert len(np.unique(edges)) == 2 * 6 * 4 and (edges[0, 0, :2, :2] == edges[0, 0, 0, 0]).all()
     assert edges[0, 0, 0, 2] != edges[0, 0, 0, 1]
     assert voxels(np.array([[0.1, 0, 0], [0.9, 0, 0], [1.1, 0, 0], [-0.1, 0, 0]]), 1.0).tolist() == [1, 1, 2, 0]
+
+
+def test_a_pyramid_mixes_the_two_levels_of_a_pixels_size():
+    pyramid = Pyramid(16, 8, 3)
+    assert pyramid.sheet == (8, 24) and pyramid.corner(1) == (0, 16) and pyramid.corner(2) == (4, 16)
+    levels = [torch.rand(*pyramid.size(k), 3) for k in range(3)]
+    sheet = torch.full((*pyramid.sheet, 3), torch.nan)
+    for k, values in enumerate(levels):
+        row, column = pyramid.corner(k)
+        sheet[row : row + len(values), column : column + values.shape[1]] = values
+    uv = torch.cat([torch.rand(500, 2), torch.tensor([[0.0, 0.0], [1.0, 1.0], [1.0, 0.0]])])  # no sample leaves its level
+    alone = [
+        F.grid_sample(values.permute(2, 0, 1)[None], 2 * uv[None, None] - 1, padding_mode="border", align_corners=False)[
+            0, :, 0
+        ].T
+        for values in levels
+    ]
+    for detail, expected in (
+        (-3.0, alone[0]),
+        (0.25, 0.75 * alone[0] + 0.25 * alone[1]),
+        (1.0, alone[1]),
+        (1.5, 0.5 * alone[1] + 0.5 * alone[2]),
+        (9.0, alone[2]),
+    ):
+        texels, weights = pyramid.sample(uv, torch.full((len(uv),), detail))
+        assert torch.allclose(gather(sheet.reshape(-1, 3), texels, weights), expected, atol=1e-5)
+    with pytest.raises(InputError, match="multiples of 8"):
+        Pyramid(12, 16, 4)
 
 
 # --- a small scene: a wall with a pattern and a highlight that moves, before a sky ------------------------------------
@@ -194,6 +234,7 @@ def view(x: float) -> View:
         origin=np.array([x, 0.0, 0.0]),
         directions=directions.astype(np.float32),
         uv=np.where(hit[..., None], uv, 0).astype(np.float32),
+        detail=np.log2(64 / 10 * 4 / 32 / directions[..., 1]).astype(np.float32),
         hit=hit,
         rgb=np.round(255 * rgb).astype(np.uint8),
         counts=np.ones(hit.shape, bool),
@@ -204,7 +245,11 @@ def surroundings() -> Surroundings:
     u, v = np.meshgrid((np.arange(64) + 0.5) / 64, (np.arange(64) + 0.5) / 64)
     positions = np.stack([10 * u - 5, np.full_like(u, 4.0), 10 * v - 5], axis=-1)
     sizes = skyboxes.half_sizes(np.array([5.0, 4.0, 5.0]), 20.0, 80.0, 3)
-    return Surroundings(positions.astype(np.float32), np.ones((64, 64), bool), np.zeros(3), sizes)
+    pyramid = Pyramid(64, 64, 2)
+    sheet, inside = np.zeros((*pyramid.sheet, 3), np.float32), np.zeros(pyramid.sheet, bool)
+    sheet[:, :64], inside[:, :64] = positions, True
+    sheet[:32, 64:], inside[:32, 64:] = positions.reshape(32, 2, 32, 2, 3).mean(axis=(1, 3)), True
+    return Surroundings(pyramid, sheet, inside, np.zeros(3), sizes)
 
 
 CONFIG = FitConfig(
@@ -231,7 +276,9 @@ def run(folder, config=CONFIG, views=None):
 
 
 def psnr(baked: Baked, seen: View) -> float:
-    rgb, _ = baked.render(seen.uv.reshape(-1, 2), seen.hit.ravel(), seen.origin, seen.directions.reshape(-1, 3))
+    rgb, _ = baked.render(
+        seen.uv.reshape(-1, 2), seen.detail.ravel(), seen.hit.ravel(), seen.origin, seen.directions.reshape(-1, 3)
+    )
     return float(-10 * np.log10(np.square(rgb.reshape(32, 32, 3) - seen.rgb / 255).mean()))
 
 
@@ -348,6 +395,8 @@ def test_rendering_is_the_baked_maps():
     scene = Scene(CONFIG, surroundings(), pixels)
     ours = scene.render(pixels)[0]
     seen = view(0.0)
-    rgb, opacity = scene.baked({}).render(seen.uv.reshape(-1, 2), seen.hit.ravel(), seen.origin, seen.directions.reshape(-1, 3))
+    rgb, opacity = scene.baked({}).render(
+        seen.uv.reshape(-1, 2), seen.detail.ravel(), seen.hit.ravel(), seen.origin, seen.directions.reshape(-1, 3)
+    )
     assert np.abs(ours.reshape(-1, 3) - rgb).max() < 1e-5
     assert (opacity[seen.hit.ravel()] == [1, 0, 0, 0]).all() and (opacity[~seen.hit.ravel(), 0] == 0).all()
