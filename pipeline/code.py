@@ -1,7 +1,7 @@
 """What code made an artifact: a digest of the stage's syntax tree and of the project modules it imports, and the commit.
 
 Code is not in a key: a stage's ``version`` is. The digest catches the author who changed the output and forgot the version
-(tests/<system>/versions.json holds the pairs). Comments, docstrings and formatting change nothing.
+(tests/versions.json holds the pairs). Comments, docstrings and formatting change nothing.
 """
 
 from __future__ import annotations

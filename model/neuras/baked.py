@@ -31,7 +31,8 @@ Layer = tuple[np.ndarray, np.ndarray]  # weight (out, in) float32, bias (out,) f
 class Baked:
     """A fitted scene. D: channels of a feature, K: codes, L: skyboxes near to far, S: texels along a skybox face.
 
-    mesh_indices (H, W), a sheet of the ``levels`` of a ``Pyramid``, and sky_indices (L, 6, S, S): uint16, the code of each texel; None without quantization.
+    mesh_indices (H, W), a sheet of the ``levels`` of a ``Pyramid``, and sky_indices (L, 6, S, S): uint16, the code of each
+    texel; None without quantization.
     mesh_features (H, W, D) and sky_features (L, 6, S, S, D): float16, instead of them; None with quantization.
     mesh_codebook, sky_codebook: (K, D) float32; None without quantization.
     mesh_mlp, sky_mlp: layers as (weight (out, in), bias (out,)) float32, see ``render``; no layers: the feature's first

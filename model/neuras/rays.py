@@ -19,8 +19,8 @@ from model.errors import InputError
 @dataclass(frozen=True, eq=False)
 class View:
     """What a camera saw. origin: (3,) float64, world. directions: (H, W, 3) float32 unit vectors. uv: (H, W, 2) float32 where
-    ``hit`` (H, W) bool, the texture coordinates of the mesh. detail: (H, W) float32, log2 of the texels that a pixel covers side by
-    side there. rgb: (H, W, 3) uint8. counts: (H, W) bool, pixels that count.
+    ``hit`` (H, W) bool, the texture coordinates of the mesh. detail: (H, W) float32, log2 of the texels that a pixel covers
+    side by side there. rgb: (H, W, 3) uint8. counts: (H, W) bool, pixels that count.
     """
 
     origin: np.ndarray

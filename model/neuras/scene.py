@@ -68,8 +68,8 @@ class FitConfig:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What the textures lie on. positions: (h, w, 3) float32, world, of the texels of the pyramid's sheet that ``inside`` (h, w)
-    bool says a sample can reach. sky_centre: (3,), sky_half_sizes: (L, 3), float64, world.
+    """What the textures lie on. positions: (h, w, 3) float32, world, of the texels of the pyramid's sheet that ``inside``
+    (h, w) bool says a sample can reach. sky_centre: (3,), sky_half_sizes: (L, 3), float64, world.
     """
 
     pyramid: Pyramid

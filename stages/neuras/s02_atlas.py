@@ -39,7 +39,7 @@ class AtlasConfig(StageConfig):
 
 class Atlas(MapStage):
     name: ClassVar[str] = "atlas"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     inputs: ClassVar[tuple[str, ...]] = ("capture", "scaffold")
     Config: ClassVar[Any] = AtlasConfig
     reasons: ClassVar[dict[str, str]] = {"not_unfolded": "xatlas left faces of the tile without a chart"}

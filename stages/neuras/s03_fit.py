@@ -107,7 +107,7 @@ class FitStageConfig(StageConfig):
 
 class Fit(RunStage):
     name: ClassVar[str] = "fit"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas")
     Config: ClassVar[Any] = FitStageConfig
 

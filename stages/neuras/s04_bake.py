@@ -27,7 +27,7 @@ class BakeConfig(StageConfig):
 
 class Bake(RunStage):
     name: ClassVar[str] = "bake"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas", "fit")
     Config: ClassVar[Any] = BakeConfig
     headline: ClassVar[str | None] = "site/index.html"

@@ -44,7 +44,7 @@ class EvaluateConfig(StageConfig):
 
 class Evaluate(MapStage):
     name: ClassVar[str] = "evaluate"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas", "fit", "bake")
     Config: ClassVar[Any] = EvaluateConfig
     headline: ClassVar[str | None] = "report.html"

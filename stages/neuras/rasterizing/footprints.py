@@ -14,9 +14,9 @@ FINEST = -10.0  # a pixel that covers a thousandth of a texel's side
 def detail(view: GBuffer, camera: Camera, atlas: AtlasMesh) -> np.ndarray:
     """(H, W) float32: log2 of the side of a square as large as a pixel's footprint, in texels; 0 where nothing is hit.
 
-    The footprint is a parallelogram: the texture coordinates' derivatives along the image's two axes, on the plane of the face.
-    A shader has the same from ``dFdx`` and ``dFdy``. Computed face by face in closed form: on a plane a + s e1 + t e2, with uv linear
-    in (s, t), its area is that of the pixel at the distance, over the cosine of incidence, times the face's texels per unit area.
+    The footprint is a parallelogram on the plane of the face: what texture coordinates change by along the image's two axes. A
+    shader has the same from ``dFdx`` and ``dFdy``. Its area has a closed form: the pixel's solid angle, times the distance
+    squared, over the cosine of incidence, times the face's texels per unit area.
     """
     hit = view.hit
     corners = np.asarray(atlas.vertices, float)[atlas.faces]

@@ -56,8 +56,8 @@ def texels(atlas: AtlasMesh) -> Texels:
 
 
 def sheet(atlas: AtlasMesh, pyramid: Pyramid, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of all texels of all levels, as they lie in the pyramid's sheet (h, w): world positions (h, w, 3) float32, and (h, w) bool:
-    whether they lie on a face or within ``reach`` texels of their level of one.
+    """Of all texels of all levels, as they lie in the pyramid's sheet (h, w): world positions (h, w, 3) float32, and whether
+    they lie on a face or within ``reach`` texels of their level of one, (h, w) bool.
 
     A coarse texel lies where the mean of its four finer ones that are on a face lies.
     """

@@ -20,8 +20,8 @@ class StreetConfig(Section):
     height: int = Field(216, ge=16)
     fov_deg: float = Field(70.0, gt=10, lt=150)  # full angle across the width
     spp: int = Field(16, ge=1)  # samples a pixel, then denoised
-    training_frames: int = Field(16, ge=2)
-    spacing: float = Field(1.5, gt=0, le=1.5)  # between neighbours of the drive, of which every other is held out
+    training_frames: int = Field(24, ge=2)
+    spacing: float = Field(1.0, gt=0, le=1.5)  # between neighbours of the drive, of which every other is held out
     shifts: tuple[float, ...] = (-3.0, -2.0, 2.0, 3.0)  # lanes beside the drive, to the right of it
     shift_frames: int = Field(5, ge=0)  # of each lane
     speed: float = Field(5.0, gt=0)  # of the car that carries the LiDAR, m/s; it turns ten times a second
