@@ -134,16 +134,22 @@ class Baked:
             raise InputError(f"{folder} holds no fitted scene ({error}): expected {ARRAYS} and {VALUES} of stage fit") from None
 
     def render(
-        self, uv: np.ndarray, detail: np.ndarray, hit: np.ndarray, origin: np.ndarray, directions: np.ndarray
+        self,
+        uv: np.ndarray,
+        spread: np.ndarray,
+        detail: np.ndarray,
+        hit: np.ndarray,
+        origin: np.ndarray,
+        directions: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Colours (N, 3) in [0, 1] and opacities (N, 1 + L), mesh first, of rays from ``origin`` (3,) along ``directions``.
 
-        uv: (N, 2) texture coordinates where the ray meets the mesh; detail: (N,) log2 of the texels that its pixel covers side
-        by side there; hit: (N,) bool, whether it does; directions: (N, 3)
-        unit vectors. The steps, which a shader repeats:
+        uv: (N, 2) texture coordinates where the ray meets the mesh; spread: (N, 2) and detail: (N,), the part of the texture
+        that its pixel covers (``Pyramid.sample``); hit: (N,) bool, whether it does; directions: (N, 3) unit vectors. The
+        steps, which a shader repeats:
 
-        1. F = sample of the map of *features* (indices do not mix): the mesh at uv, bilinear in two levels and mixed by detail
-           (``Pyramid.sample``), each skybox where ``model.neuras.skyboxes.intersect`` says, bilinear.
+        1. F = sample of the map of *features* (indices do not mix): the mesh as ``Pyramid.sample`` says, each skybox where
+           ``model.neuras.skyboxes.intersect`` says, bilinear.
         2. Mesh: colour = mesh_mlp([F, d]) with ReLU between layers; opacity = 1 where ``hit``, else 0 (eq. 1 and 2).
         3. Skybox: h = relu(first layer of sky_mlp(F)); opacity = sigmoid(sky_opacity(h)); colour = the other layers of
            sky_mlp of [h, d], ReLU between them. So the opacity does not depend on the view (eq. 3).
@@ -158,8 +164,8 @@ class Baked:
         rgb = torch.zeros(len(rays), 3)
         with torch.no_grad():
             opacity[:, 0] = hit_rays.float()
-            places, covered = (torch.from_numpy(np.ascontiguousarray(x, dtype=np.float32))[hit_rays] for x in (uv, detail))
-            features = self._sample("mesh", *self.pyramid.sample(places, covered))
+            looks = (torch.from_numpy(np.ascontiguousarray(x, dtype=np.float32))[hit_rays] for x in (uv, spread, detail))
+            features = self._sample("mesh", *self.pyramid.sample(*looks))
             rgb[hit_rays] = _colour(self.mesh_mlp, self._with_direction(features, rays[hit_rays]))
             open_rays = rays[~hit_rays]
             seen, light = torch.zeros(len(open_rays), self.sky_size[0]), torch.zeros(len(open_rays), 3)

@@ -19,13 +19,14 @@ from model.errors import InputError
 @dataclass(frozen=True, eq=False)
 class View:
     """What a camera saw. origin: (3,) float64, world. directions: (H, W, 3) float32 unit vectors. uv: (H, W, 2) float32 where
-    ``hit`` (H, W) bool, the texture coordinates of the mesh. detail: (H, W) float32, log2 of the texels that a pixel covers
-    side by side there. rgb: (H, W, 3) uint8. counts: (H, W) bool, pixels that count.
+    ``hit`` (H, W) bool, the texture coordinates of the mesh. spread: (H, W, 2), detail: (H, W), float32, the part of the
+    texture that a pixel covers there (``Pyramid.sample``). rgb: (H, W, 3) uint8. counts: (H, W) bool, pixels that count.
     """
 
     origin: np.ndarray
     directions: np.ndarray
     uv: np.ndarray
+    spread: np.ndarray
     detail: np.ndarray
     hit: np.ndarray
     rgb: np.ndarray
@@ -36,13 +37,14 @@ class View:
 class Batch:
     """Pixels (B,) in patches of n x n, patch after patch, row after row.
 
-    origins, directions: (B, 3), origins from the skyboxes' centre. uv: (B, 2). detail: (B,). hit, counts: (B,) bool. open:
-    (B,) bool, neither the pixel nor one around it sees the mesh. rgb: (B, 3) in [0, 1].
+    origins, directions: (B, 3), origins from the skyboxes' centre. uv, spread: (B, 2). detail: (B,). hit, counts: (B,) bool.
+    open: (B,) bool, neither the pixel nor one around it sees the mesh. rgb: (B, 3) in [0, 1].
     """
 
     origins: Tensor
     directions: Tensor
     uv: Tensor
+    spread: Tensor
     detail: Tensor
     hit: Tensor
     counts: Tensor
@@ -75,7 +77,7 @@ class Pixels:
             return torch.from_numpy(np.concatenate([getattr(v, name).reshape(v.hit.size, -1) for v in views])).to(device)
 
         self.origins = torch.from_numpy(np.stack([v.origin - centre for v in views]).astype(np.float32)).to(device)
-        self.directions, self.uv, self.rgb = flat("directions"), flat("uv"), flat("rgb")
+        self.directions, self.uv, self.spread, self.rgb = (flat(name) for name in ("directions", "uv", "spread", "rgb"))
         self.detail, self.hit, self.counts = (flat(name)[:, 0] for name in ("detail", "hit", "counts"))
         self.open = torch.from_numpy(np.concatenate([_open(view.hit).ravel() for view in views])).to(device)
 
@@ -85,7 +87,7 @@ class Pixels:
             self.origins[views],
             *(
                 values.index_select(0, pixels)
-                for values in (self.directions, self.uv, self.detail, self.hit, self.counts, self.open)
+                for values in (self.directions, self.uv, self.spread, self.detail, self.hit, self.counts, self.open)
             ),
             self.rgb.index_select(0, pixels).float() / 255,
             self.patch,

@@ -49,19 +49,21 @@ class Pyramid:
         """Row and column of the sheet where a level begins."""
         return (0, 0) if level == 0 else (self.height - (self.height >> (level - 1)), self.width)
 
-    def sample(self, uv: Tensor, detail: Tensor) -> tuple[Tensor, Tensor]:
+    def sample(self, uv: Tensor, spread: Tensor, detail: Tensor) -> tuple[Tensor, Tensor]:
         """Texels of the sheet (N, K) int64, as row * sheet width + column, and weights (N, K) float32.
 
-        uv: (N, 2). detail: (N,) log2 of the texels of level 0 that a pixel covers side by side; the two levels nearest to it
-        are mixed (K = 8). K = 4 where there is one level.
+        uv: (N, 2), where pixels look. Each takes the mean of two samples at uv + spread and uv - spread, ``spread`` (N, 2).
+        detail: (N,) log2 of the texels of level 0 that a sample covers side by side; the two levels nearest to it are mixed
+        (K = 16). One level is sampled once, at uv (K = 4).
         """
         if self.levels == 1:
             return bilinear(uv, self.width, self.height)
         detail = detail.clamp(0, self.levels - 1)
         finer = detail.floor().clamp(max=self.levels - 2)
-        texels, weights = zip(self._of_level(uv, finer.long()), self._of_level(uv, finer.long() + 1), strict=True)
-        share = (detail - finer)[:, None]
-        return torch.cat(texels, dim=1), torch.cat([weights[0] * (1 - share), weights[1] * share], dim=1)
+        share = 0.5 * (detail - finer)[:, None]
+        levels = ((finer.long(), 0.5 - share), (finer.long() + 1, share))
+        samples = [(*self._of_level(place, level), part) for place in (uv + spread, uv - spread) for level, part in levels]
+        return torch.cat([texels for texels, _, _ in samples], dim=1), torch.cat([w * part for _, w, part in samples], dim=1)
 
     def _of_level(self, uv: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
         """Texels and weights (N, 4) in a level of each sample's own, ``level`` (N,)."""

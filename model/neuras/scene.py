@@ -152,7 +152,7 @@ class Scene:
         Pixels that do not count have no samples. The sky's are those of rays that miss the mesh, ray after ray, near to far.
         """
         rays = torch.nonzero(batch.hit & batch.counts)[:, 0]
-        found = {"mesh": (*self.pyramid.sample(batch.uv[rays], batch.detail[rays]), rays)}
+        found = {"mesh": (*self.pyramid.sample(batch.uv[rays], batch.spread[rays], batch.detail[rays]), rays)}
         rays = torch.nonzero(~batch.hit & batch.counts)[:, 0]
         side, origins, directions = self.config.sky_side, batch.origins[rays], batch.directions[rays]
         texels, weights = [], []

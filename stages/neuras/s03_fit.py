@@ -159,12 +159,12 @@ def _view(frame: FrameRecord, atlas: AtlasMesh, caster: Any) -> View:
     import numpy as np
 
     from model.neuras.rays import View
-    from stages.neuras.rasterizing.footprints import detail
+    from stages.neuras.rasterizing.footprints import footprint
 
     seen = caster.view(frame.camera)
     return View(
         origin=frame.camera.position,
-        detail=detail(seen, frame.camera, atlas),
+        **vars(footprint(seen, frame.camera, atlas)),
         directions=frame.camera.directions().astype(np.float32),
         uv=seen.interpolate(atlas.faces, atlas.uvs),
         hit=seen.hit,

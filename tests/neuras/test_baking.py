@@ -16,7 +16,7 @@ from stages.graphics.cameras import Camera
 from stages.neuras.baking import browser, drawing, shaders
 from stages.neuras.baking.site import PAGE, write_site
 from stages.neuras.rasterizing.casting import Caster
-from stages.neuras.rasterizing.footprints import detail
+from stages.neuras.rasterizing.footprints import footprint
 from stages.neuras.records import AtlasMesh, CaptureInfo, FrameRecord
 from tests.neuras import scenes
 
@@ -33,8 +33,9 @@ def reference(baked: Baked, atlas: AtlasMesh, camera: Camera) -> tuple[np.ndarra
     """(H, W, 3) colours and (H, W) hits as torch computes them."""
     view = Caster(atlas.vertices, atlas.faces).view(camera)
     uv = view.interpolate(atlas.faces, atlas.uvs).reshape(-1, 2)
-    covered = detail(view, camera, atlas).ravel()
-    rgb, _ = baked.render(uv, covered, view.hit.ravel(), camera.position, camera.directions().reshape(-1, 3))
+    covered = footprint(view, camera, atlas)
+    looks = uv, covered.spread.reshape(-1, 2), covered.detail.ravel(), view.hit.ravel()
+    rgb, _ = baked.render(*looks, camera.position, camera.directions().reshape(-1, 3))
     return rgb.reshape(camera.height, camera.width, 3), view.hit
 
 

@@ -8,7 +8,7 @@ import trimesh
 
 from stages.graphics.cameras import Camera
 from stages.neuras.rasterizing.casting import Caster
-from stages.neuras.rasterizing.footprints import detail
+from stages.neuras.rasterizing.footprints import footprint
 from stages.neuras.rasterizing.texels import sheet, texels
 from stages.neuras.records import Mesh
 from stages.neuras.surfaces import reconstruct, simplify, unfold, visibility
@@ -200,13 +200,13 @@ def test_tiles_do_not_overlap_in_the_texture(atlas):
     assert (same | neighbours).all()
 
 
-def test_detail_is_the_area_that_neighbouring_rays_cut_out():
-    """Against the definition: texture coordinates half a pixel to each side, on the plane of the face."""
+def test_footprints_are_what_neighbouring_rays_cut_out():
+    """Against the definition: texture coordinates a bit to each side of a pixel's centre, on the plane of the face."""
     atlas, camera = scenes.atlas(), scenes.looking_at((4.0, 3.0, 2.0))
     view = Caster(atlas.vertices, atlas.faces).view(camera)
-    ours = detail(view, camera, atlas)
+    ours = footprint(view, camera, atlas)
     centres, size = camera.pixel_centres(), np.array([atlas.width, atlas.height])
-    corners = atlas.vertices[atlas.faces].astype(float)
+    corners, oblong = atlas.vertices[atlas.faces].astype(float), []
     for row, column in np.argwhere(view.hit)[::37]:
         a, b, c = corners[view.face[row, column]]
         flat = atlas.uvs[atlas.faces[view.face[row, column]]] * size
@@ -216,11 +216,17 @@ def test_detail_is_the_area_that_neighbouring_rays_cut_out():
             s, t, _ = np.linalg.solve(np.stack([b - a, c - a, -ray], axis=1), camera.position - a)
             return flat[0] + s * (flat[1] - flat[0]) + t * (flat[2] - flat[0])
 
-        across = place((1e-3, 0)) - place((-1e-3, 0))
-        down = place((0, 1e-3)) - place((0, -1e-3))
-        area = abs(across[0] * down[1] - across[1] * down[0]) / 4e-6
-        assert ours[row, column] == pytest.approx(0.5 * np.log2(area), abs=1e-3)
-    assert (ours[~view.hit] == 0).all() and view.hit.any()
+        across = (place((1e-3, 0)) - place((-1e-3, 0))) / 2e-3
+        down = (place((0, 1e-3)) - place((0, -1e-3))) / 2e-3
+        longer = max(across, down, key=np.linalg.norm)
+        length = np.linalg.norm(longer)
+        width = abs(across[0] * down[1] - across[1] * down[0]) / length
+        assert ours.detail[row, column] == pytest.approx(np.log2(max(length / 2, width)), abs=1e-3)
+        expected = 0.25 * (1 - width / length) * longer
+        assert np.allclose(ours.spread[row, column] * size, expected, atol=1e-3 * length)
+        oblong.append(length / width)
+    assert max(oblong) > 3 and min(oblong) < 1.5
+    assert (ours.detail[~view.hit] == 0).all() and (ours.spread[~view.hit] == 0).all()
 
 
 def test_a_coarse_texel_lies_amid_the_finer_ones():

@@ -136,9 +136,10 @@ class Drawing:
         eye = pose[:3, 3] - self._centre
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ eye
-        matrix, pixel = projection(camera, self._near, self._far) @ view, 1 / (camera.fx * camera.fy)
+        matrix = projection(camera, self._near, self._far) @ view
+        steps = {"pixel_right": pose[:3, 0] / camera.fx, "pixel_down": -pose[:3, 1] / camera.fy}
         for program, values in (
-            (self._mesh, {"clip_from_scene": matrix.T, "eye": eye, "mode": MODES.index(mode), "pixel": pixel}),
+            (self._mesh, {"clip_from_scene": matrix.T, "eye": eye, "mode": MODES.index(mode), **steps}),
             (self._sky, {"world_from_camera": pose[:3, :3].T, "lens": lens(camera), "eye": eye, "mode": MODES.index(mode)}),
         ):
             for name, value in values.items():

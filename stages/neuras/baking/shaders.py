@@ -101,7 +101,8 @@ in vec3 ray;
 flat in float chart_number;
 out vec4 colour;
 uniform int mode;
-uniform float pixel;  // area of a pixel at distance 1: 1 / (fx fy), focal lengths in pixels
+uniform vec3 pixel_right;  // from one pixel to the next at distance 1: the camera's right over its focal length in pixels
+uniform vec3 pixel_down;
 uniform usampler2D codes;
 {samplers}{COLOURS}{_pyramid(baked.pyramid)}
 {_network("mesh_colour", baked.mesh_mlp, count, baked.channels, baked.view_dependent)}
@@ -113,7 +114,7 @@ void main() {{
         colour = vec4(number_colour(float(texelFetch(codes, ivec2(place * texture_size), 0).r)), 1.0);
         return;
     }}
-{_detail(baked.pyramid)}{features}    colour = vec4(clamp(mesh_colour({_features(count)}, normalize(ray)), 0.0, 1.0), 1.0);
+{_footprint(baked.pyramid)}{features}    colour = vec4(clamp(mesh_colour({_features(count)}, normalize(ray)), 0.0, 1.0), 1.0);
 }}
 """
     return DIALECTS[dialect] + MESH_VERTEX, DIALECTS[dialect] + body
@@ -173,7 +174,11 @@ void main() {{
 
 
 def _pyramid(pyramid: Pyramid) -> str:
-    """Constants and functions that look up a level of the mesh's sheet; ``Pyramid.sample`` in GLSL."""
+    """Constants and functions that look up the mesh's sheet; ``footprints.footprint`` and ``Pyramid.sample`` in GLSL.
+
+    ``dFdx`` and ``dFdy`` are differences from pixel to pixel, but all of them lie on the plane of one face. There texture
+    coordinates are linear, so any step on the plane has its texture coordinates from two such differences, exactly.
+    """
     height, width = pyramid.sheet
     corners = ", ".join(f"vec2({column}.0, {row}.0)" for row, column in map(pyramid.corner, range(pyramid.levels)))
     text = f"const vec2 texture_size = vec2({pyramid.width}.0, {pyramid.height}.0);\n"
@@ -181,39 +186,47 @@ def _pyramid(pyramid: Pyramid) -> str:
         return text
     return f"""{text}const vec2 sheet_size = vec2({width}.0, {height}.0);
 const vec2 corners[{pyramid.levels}] = vec2[{pyramid.levels}]({corners});
-vec2 in_sheet(int level) {{  // where a level of the sheet has this place, half a texel from the level's border at least
+vec2 in_sheet(vec2 at, int level) {{  // where a level has this place, half a texel from the level's border at least
     vec2 size = texture_size / exp2(float(level));
-    return (corners[level] + clamp(place * size, vec2(0.5), size - 0.5)) / sheet_size;
+    return (corners[level] + clamp(at * size, vec2(0.5), size - 0.5)) / sheet_size;
+}}
+vec2 side(vec3 pixel) {{  // texels from one pixel to the next; pixel: that step at distance 1
+    vec3 x = dFdx(ray);
+    vec3 y = dFdy(ray);
+    vec3 normal = cross(x, y);
+    vec3 moved = (pixel - ray * (dot(normal, pixel) / dot(normal, ray))) / gl_FragCoord.w;
+    vec2 shares = vec2(dot(cross(moved, y), normal), dot(cross(x, moved), normal)) / dot(normal, normal);
+    return (shares.x * dFdx(place) + shares.y * dFdy(place)) * texture_size;
 }}
 """
 
 
-def _detail(pyramid: Pyramid) -> str:
-    """Statements: the two levels whose texels are as large as the pixel, and the coarser one's share.
-
-    ``dFdx`` and ``dFdy`` are differences over two pixels, but all of them lie on one plane: texels and area change alike, and
-    the ratio of the two is exact. So this equals ``stages.neuras.rasterizing.footprints.detail``.
-    """
+def _footprint(pyramid: Pyramid) -> str:
+    """Statements: where the two samples look in each of two levels, and the coarser level's share."""
     if pyramid.levels == 1:
         return ""
-    return f"""    vec2 across = dFdx(place) * texture_size;
-    vec2 down = dFdy(place) * texture_size;
-    float depth = 1.0 / gl_FragCoord.w;
-    float facing = abs(dot(cross(dFdx(ray), dFdy(ray)), ray));
-    float texels = abs(across.x * down.y - across.y * down.x) * pixel * depth * depth * depth / max(facing, 1e-20);
-    float detail = clamp(0.5 * log2(max(texels, 1e-12)), 0.0, {pyramid.levels - 1}.0);
+    return f"""    vec2 across = side(pixel_right);
+    vec2 down = side(pixel_down);
+    vec2 longer = length(across) >= length(down) ? across : down;
+    float long_side = max(length(longer), 1e-12);
+    float wide = abs(across.x * down.y - across.y * down.x) / long_side;
+    vec2 spread = 0.25 * (1.0 - wide / long_side) * longer / texture_size;
+    float detail = clamp(log2(max(max(0.5 * long_side, wide), 1e-12)), 0.0, {pyramid.levels - 1}.0);
     int finer = min(int(detail), {pyramid.levels - 2});
     float share = detail - float(finer);
-    vec2 fine = in_sheet(finer);
-    vec2 coarse = in_sheet(finer + 1);
+    vec2 a = in_sheet(place + spread, finer);
+    vec2 b = in_sheet(place - spread, finer);
+    vec2 c = in_sheet(place + spread, finer + 1);
+    vec2 d = in_sheet(place - spread, finer + 1);
 """
 
 
-def _levels(pyramid: Pyramid, sampler: str) -> str:
+def _levels(pyramid: Pyramid, map: str) -> str:
     """The features of the mesh."""
     if pyramid.levels == 1:
-        return f"texture({sampler}, place)"
-    return f"mix(texture({sampler}, fine), texture({sampler}, coarse), share)"
+        return f"texture({map}, place)"
+    fine, coarse = (f"texture({map}, {one}) + texture({map}, {other})" for one, other in ("ab", "cd"))
+    return f"0.5 * mix({fine}, {coarse}, share)"
 
 
 def _texel(sample: str, ranges: Ranges | None, index: int) -> str:

@@ -17,7 +17,7 @@ from pipeline.store import Artifact
 from stages.graphics.cameras import Camera
 from stages.neuras.baking import drawing
 from stages.neuras.rasterizing.casting import Caster, GBuffer
-from stages.neuras.rasterizing.footprints import detail
+from stages.neuras.rasterizing.footprints import footprint
 from stages.neuras.records import AtlasMesh, CaptureInfo, load_atlas
 
 
@@ -35,8 +35,9 @@ class Reference:
         """The picture of a camera whose view of the mesh is known."""
         uv = view.interpolate(self._atlas.faces, self._atlas.uvs).reshape(-1, 2)
         rays = camera.directions().reshape(-1, 3)
-        covered = detail(view, camera, self._atlas).ravel()
-        colours, _ = self._baked.render(uv, covered, view.hit.ravel(), camera.position, rays)
+        covered = footprint(view, camera, self._atlas)
+        looks = uv, covered.spread.reshape(-1, 2), covered.detail.ravel(), view.hit.ravel()
+        colours, _ = self._baked.render(*looks, camera.position, rays)
         return colours.reshape(camera.height, camera.width, 3)
 
     def close(self) -> None:

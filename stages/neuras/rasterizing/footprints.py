@@ -1,6 +1,8 @@
-"""How many texels a pixel covers where it sees the mesh: which level of a texture's pyramid it needs."""
+"""Which part of a texture a pixel covers: where to sample it, and at which level of its pyramid."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,25 +13,52 @@ from stages.neuras.records import AtlasMesh
 FINEST = -10.0  # a pixel that covers a thousandth of a texel's side
 
 
-def detail(view: GBuffer, camera: Camera, atlas: AtlasMesh) -> np.ndarray:
-    """(H, W) float32: log2 of the side of a square as large as a pixel's footprint, in texels; 0 where nothing is hit.
+@dataclass(frozen=True, eq=False)
+class Footprint:
+    """spread: (H, W, 2) float32, texture coordinates from the pixel's centre to one of its two samples; the other lies on the
+    opposite side. detail: (H, W) float32, log2 of the texels of the finest level that a sample covers side by side. 0 where
+    nothing is hit.
+    """
 
-    The footprint is a parallelogram on the plane of the face: what texture coordinates change by along the image's two axes. A
-    shader has the same from ``dFdx`` and ``dFdy``. Its area has a closed form: the pixel's solid angle, times the distance
-    squared, over the cosine of incidence, times the face's texels per unit area.
+    spread: np.ndarray
+    detail: np.ndarray
+
+
+def footprint(view: GBuffer, camera: Camera, atlas: AtlasMesh) -> Footprint:
+    """Of every pixel.
+
+    A pixel covers a parallelogram on the plane of the face. Its sides are what texture coordinates change by along the image's
+    two axes. Its length is the longer side, its width the area over the length. On a road it is many times as long as wide:
+    one sample would be either too coarse across or too fine along. So two samples share the length. Each lies a quarter of
+    what the length exceeds the width by from the centre, and covers half the length, or the width if that is more.
     """
     hit = view.hit
-    corners = np.asarray(atlas.vertices, float)[atlas.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # as long as twice the area
-    twice = np.linalg.norm(normals, axis=1)
-    flat = (atlas.uvs.astype(float) * (atlas.width, atlas.height))[atlas.faces]
-    (x1, y1), (x2, y2) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
-    density = np.abs(x1 * y2 - x2 * y1) / np.maximum(twice, 1e-30)  # texels per unit area
-    face, rays = view.face[hit], camera.directions()[hit]
-    along = rays @ -camera.camera_to_world[:3, 2]
-    cosine = np.abs(np.einsum("ij,ij->i", normals[face], rays)) / np.maximum(twice[face], 1e-30)
-    solid_angle = along**3 / (camera.fx * camera.fy)
-    area = density[face] * solid_angle * view.depth[hit].astype(float) ** 2 / np.maximum(cosine, 1e-6)
-    out = np.zeros(hit.shape, np.float32)
-    out[hit] = np.maximum(0.5 * np.log2(np.maximum(area, 1e-12)), FINEST)
-    return out
+    face = view.face[hit]
+    corners = np.asarray(atlas.vertices, float)[atlas.faces[face]]
+    flat = (atlas.uvs.astype(float) * (atlas.width, atlas.height))[atlas.faces[face]]
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(first, second)
+    square = np.maximum(_dot(normal, normal), 1e-60)
+    rays = camera.directions()[hit]
+    rays /= (rays @ -camera.camera_to_world[:3, 2])[:, None]  # of length 1 along the axis
+    depth = view.depth[hit] / np.linalg.norm(rays, axis=1)
+    facing = _dot(normal, rays)
+    facing = np.where(np.abs(facing) < 1e-30, 1e-30, facing)
+    sides = []
+    for step in (camera.camera_to_world[:3, 0] / camera.fx, -camera.camera_to_world[:3, 1] / camera.fy):
+        moved = depth[:, None] * (step - rays * (normal @ step / facing)[:, None])  # on the plane, from pixel to pixel
+        s, t = (_dot(np.cross(a, b), normal) / square for a, b in ((moved, second), (first, moved)))
+        sides.append(s[:, None] * (flat[:, 1] - flat[:, 0]) + t[:, None] * (flat[:, 2] - flat[:, 0]))
+    across, down = sides
+    lengths = np.stack([np.linalg.norm(side, axis=1) for side in sides])
+    length = np.maximum(lengths.max(axis=0), 1e-12)
+    width = np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]) / length
+    longer = np.where((lengths[0] >= lengths[1])[:, None], across, down)
+    spread, detail = np.zeros((*hit.shape, 2), np.float32), np.zeros(hit.shape, np.float32)
+    spread[hit] = 0.25 * (1 - width / length)[:, None] * longer / (atlas.width, atlas.height)
+    detail[hit] = np.maximum(np.log2(np.maximum(np.maximum(0.5 * length, width), 1e-12)), FINEST)
+    return Footprint(spread, detail)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->i", a, b)

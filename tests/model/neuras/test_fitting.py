@@ -209,8 +209,15 @@ def test_a_pyramid_mixes_the_two_levels_of_a_pixels_size():
         (1.5, 0.5 * alone[1] + 0.5 * alone[2]),
         (9.0, alone[2]),
     ):
-        texels, weights = pyramid.sample(uv, torch.full((len(uv),), detail))
+        texels, weights = pyramid.sample(uv, torch.zeros_like(uv), torch.full((len(uv),), detail))
         assert torch.allclose(gather(sheet.reshape(-1, 3), texels, weights), expected, atol=1e-5)
+    spread = torch.tensor([[0.05, -0.02]]).expand(len(uv), 2)
+    sides = [
+        gather(sheet.reshape(-1, 3), *pyramid.sample(uv + s, 0 * spread, torch.full((len(uv),), 0.7)))
+        for s in (spread, -spread)
+    ]
+    both = gather(sheet.reshape(-1, 3), *pyramid.sample(uv, spread, torch.full((len(uv),), 0.7)))
+    assert torch.allclose(both, (sides[0] + sides[1]) / 2, atol=1e-5) and not torch.allclose(both, sides[0], atol=1e-2)
     with pytest.raises(InputError, match="multiples of 8"):
         Pyramid(12, 16, 4)
 
@@ -234,6 +241,7 @@ def view(x: float) -> View:
         origin=np.array([x, 0.0, 0.0]),
         directions=directions.astype(np.float32),
         uv=np.where(hit[..., None], uv, 0).astype(np.float32),
+        spread=np.zeros((*hit.shape, 2), np.float32),
         detail=np.log2(64 / 10 * 4 / 32 / directions[..., 1]).astype(np.float32),
         hit=hit,
         rgb=np.round(255 * rgb).astype(np.uint8),
@@ -277,7 +285,12 @@ def run(folder, config=CONFIG, views=None):
 
 def psnr(baked: Baked, seen: View) -> float:
     rgb, _ = baked.render(
-        seen.uv.reshape(-1, 2), seen.detail.ravel(), seen.hit.ravel(), seen.origin, seen.directions.reshape(-1, 3)
+        seen.uv.reshape(-1, 2),
+        seen.spread.reshape(-1, 2),
+        seen.detail.ravel(),
+        seen.hit.ravel(),
+        seen.origin,
+        seen.directions.reshape(-1, 3),
     )
     return float(-10 * np.log10(np.square(rgb.reshape(32, 32, 3) - seen.rgb / 255).mean()))
 
@@ -396,7 +409,12 @@ def test_rendering_is_the_baked_maps():
     ours = scene.render(pixels)[0]
     seen = view(0.0)
     rgb, opacity = scene.baked({}).render(
-        seen.uv.reshape(-1, 2), seen.detail.ravel(), seen.hit.ravel(), seen.origin, seen.directions.reshape(-1, 3)
+        seen.uv.reshape(-1, 2),
+        seen.spread.reshape(-1, 2),
+        seen.detail.ravel(),
+        seen.hit.ravel(),
+        seen.origin,
+        seen.directions.reshape(-1, 3),
     )
     assert np.abs(ours.reshape(-1, 3) - rgb).max() < 1e-5
     assert (opacity[seen.hit.ravel()] == [1, 0, 0, 0]).all() and (opacity[~seen.hit.ravel(), 0] == 0).all()

@@ -175,7 +175,8 @@ class Viewer {
     set(this.mesh, "clip_from_scene", "uniformMatrix4fv", false, transposed(matrix));
     set(this.mesh, "eye", "uniform3fv", pose.eye);
     set(this.mesh, "mode", "uniform1i", this.mode);
-    set(this.mesh, "pixel", "uniform1f", 4 / (this.canvas.width * this.canvas.height * this.lens[0] * this.lens[1]));
+    set(this.mesh, "pixel_right", "uniform3fv", pose.right.map((x) => (2 * x) / (this.canvas.width * this.lens[0])));
+    set(this.mesh, "pixel_down", "uniform3fv", pose.up.map((x) => (-2 * x) / (this.canvas.height * this.lens[1])));
     gl.bindVertexArray(this.vertices);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.wireframe ? this.edgeBuffer : this.triangleBuffer);
     gl.drawElements(this.wireframe ? gl.LINES : gl.TRIANGLES, this.wireframe ? this.counts.edges : this.counts.triangles, gl.UNSIGNED_INT, 0);
