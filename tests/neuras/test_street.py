@@ -72,10 +72,10 @@ def test_the_default_drive_keeps_its_promises():
     x = {
         split: np.array([p.camera.position[0] for p in frames if p.split == split]) for split in ("train", "test", "validation")
     }
-    assert len(x["train"]) == 16 and np.ptp(x["train"]) >= 45 and np.diff(x["train"]).max() <= 3.0
+    assert len(x["train"]) == 24 and np.ptp(x["train"]) >= 45 and np.diff(x["train"]).max() <= 3.0
     assert len(x["test"]) >= 8 and len(x["validation"]) >= 3
     held_out = np.concatenate([x["test"], x["validation"]])
-    assert np.abs(held_out[:, None] - x["train"]).min() >= 1.4  # between, not beside
+    assert np.abs(held_out[:, None] - x["train"]).min() >= 0.99  # halfway between, not beside
     for shift in (-3.0, -2.0, 2.0, 3.0):
         lane = [p for p in frames if p.shift == shift]
         assert len(lane) == 5 and {p.split for p in lane} == {"shift"}
@@ -89,9 +89,9 @@ def test_the_default_drive_keeps_its_promises():
 def test_a_flight_holds_out_half():
     frames = poses(StreetConfig(preset="drone", length=200))
     splits = [p.split for p in frames]
-    assert splits.count("train") == 16 and splits.count("test") + splits.count("validation") == 16
+    assert splits.count("train") == 24 and splits.count("test") + splits.count("validation") == 24
     down = [p.camera.camera_to_world[2, 2] for p in frames]
-    assert sum(value > 0.999 for value in down) == 16 and min(down) < 0.8
+    assert sum(value > 0.999 for value in down) == 24 and min(down) < 0.8
 
 
 @pytest.mark.parametrize("preset", ["street", "drone"])

@@ -27,8 +27,11 @@ HALF = 2  # bytes of a half float
 
 
 def plain(scene: Scene) -> Scene:
-    """The same mesh with one 8-bit colour texture of the same size, and one skybox of the same side: no network."""
+    """The same mesh with one 8-bit colour texture as large as the finest level, one sample a pixel, and one skybox of the same
+    side: no network.
+    """
     baked = scene.baked
+    finest = baked.mesh_texture()[: baked.pyramid.height, : baked.pyramid.width, :3]
     side = baked.sky_size[1]
     colours = Baked(
         mesh_mlp=[],
@@ -37,8 +40,7 @@ def plain(scene: Scene) -> Scene:
         sky_centre=baked.sky_centre,
         sky_half_sizes=baked.sky_half_sizes[-1:],
         view_dependent=False,
-        levels=baked.levels,
-        mesh_features=np.clip(baked.mesh_texture()[..., :3], 0, 1).astype(np.float16),
+        mesh_features=np.clip(finest, 0, 1).astype(np.float16),
         sky_features=np.zeros((1, 6, side, side, 3), np.float16),
     )
     return Scene(colours, scene.atlas, scene.info)
