@@ -15,8 +15,7 @@ from pipeline.errors import UserError
 from stages.graphics.cameras import Camera
 from stages.neuras.baking import browser, drawing, shaders
 from stages.neuras.baking.site import PAGE, write_site
-from stages.neuras.rasterizing.casting import Caster
-from stages.neuras.rasterizing.footprints import footprint
+from stages.neuras.evaluation.renderers import Reference
 from stages.neuras.records import AtlasMesh, CaptureInfo, FrameRecord
 from tests.neuras import scenes
 
@@ -31,12 +30,9 @@ def needs_opengl():
 
 def reference(baked: Baked, atlas: AtlasMesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, 3) colours and (H, W) hits as torch computes them."""
-    view = Caster(atlas.vertices, atlas.faces).view(camera)
-    uv = view.interpolate(atlas.faces, atlas.uvs).reshape(-1, 2)
-    covered = footprint(view, camera, atlas)
-    looks = uv, covered.spread.reshape(-1, 2), covered.detail.ravel(), view.hit.ravel()
-    rgb, _ = baked.render(*looks, camera.position, camera.directions().reshape(-1, 3))
-    return rgb.reshape(camera.height, camera.width, 3), view.hit
+    by_torch = Reference(baked, atlas)
+    view = by_torch.caster.view(camera)
+    return by_torch.shade(camera, view), view.hit
 
 
 @pytest.mark.parametrize(

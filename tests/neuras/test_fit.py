@@ -22,8 +22,8 @@ from pipeline.store.files import hash_file
 from stages.graphics.arrays import pack_json
 from stages.graphics.cameras import Camera
 from stages.graphics.page import png
+from stages.neuras.evaluation.renderers import Reference
 from stages.neuras.rasterizing.casting import Caster
-from stages.neuras.rasterizing.footprints import footprint
 from stages.neuras.records import FRAME, CaptureInfo, FrameRecord, save
 from stages.neuras.s03_fit import Fit, FitStageConfig
 from tests.model.lpips import write_weights
@@ -109,13 +109,8 @@ def test_files_of_a_fit(tmp_path, inputs):
 
 def test_the_unseen_frame_is_rendered_well(tmp_path, inputs):
     baked, flat, unseen = Baked.load(run(tmp_path, inputs)[0].files), scenes.atlas(), frame(5, "test", scenes.atlas())
-    seen = Caster(flat.vertices, flat.faces).view(unseen.camera)
-    uv, directions = seen.interpolate(flat.faces, flat.uvs).reshape(-1, 2), unseen.camera.directions().reshape(-1, 3)
-    covered = footprint(seen, unseen.camera, flat)
-    looks = uv, covered.spread.reshape(-1, 2), covered.detail.ravel(), seen.hit.ravel()
-    rgb, _ = baked.render(*looks, unseen.camera.position, directions)
-    truth = unseen.image() / 255
-    assert -10 * np.log10(np.square(rgb.reshape(truth.shape) - truth).mean()) > 24
+    rgb, truth = Reference(baked, flat).render(unseen.camera), unseen.image() / 255
+    assert -10 * np.log10(np.square(rgb - truth).mean()) > 24
     assert -10 * np.log10(np.square(truth.mean(axis=(0, 1)) - truth).mean()) < 15
 
 

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline.store import Store
 from stages.graphics.arrays import unpack_json
 from stages.neuras.records import CaptureInfo, frames, scaffold_mesh
+from tests.neuras.processes import artifact, run_pipeline
 
 pytestmark = pytest.mark.slow
-ROOT = Path(__file__).resolve().parents[2]
 SMALL = [
     "system=neuras", "stage=evaluate", "capture.preset=drone", "capture.length=100", "capture.texture_size=64",
     "capture.training_frames=6", "capture.width=96", "capture.height=72", "capture.spp=2", "capture.columns=240",
@@ -28,15 +24,8 @@ SMALL = [
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flight")
-    command = [sys.executable, "-m", "pipeline", *SMALL, f"store={folder}"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1200, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    run_pipeline(*SMALL, f"store={folder}")
     return folder
-
-
-def artifact(store: Path, stage: str):
-    (found,) = Store(store).artifacts(f"neuras/{stage}")
-    return found
 
 
 def test_cameras_look_down_from_above_and_a_random_half_is_held_out(store):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +10,8 @@ from PIL import Image
 
 from pipeline.store import Store
 from stages.neuras.records import CaptureInfo, frames, load_atlas, scaffold_mesh
+from tests.neuras.processes import artifact, run_pipeline
 
-ROOT = Path(__file__).resolve().parents[2]
 SMALL = [
     "system=neuras", "capture.length=90", "capture.texture_size=64", "capture.training_frames=3", "capture.width=96",
     "capture.height=54", "capture.spp=1", "capture.shifts=[2.0]", "capture.shift_frames=1", "capture.columns=90",
@@ -26,21 +24,13 @@ QUICK = ["evaluate.video_frames=2", "evaluate.timing_frames=1", "evaluate.timing
 
 
 def run(store: Path, *words: str) -> str:
-    command = [sys.executable, "-m", "pipeline", *SMALL, f"store={store}", *words]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    return run_pipeline(*SMALL, f"store={store}", *words, timeout=900)
 
 
 @pytest.fixture(scope="module")
 def line(tmp_path_factory):
     store = tmp_path_factory.mktemp("neuras")
     return store, run(store, "stage=bake")
-
-
-def artifact(store: Path, stage: str):
-    (found,) = Store(store).artifacts(f"neuras/{stage}")
-    return found
 
 
 def test_from_nothing_to_a_page(line):

@@ -283,8 +283,9 @@ def run(folder, config=CONFIG, views=None):
     return *found, shown
 
 
-def psnr(baked: Baked, seen: View) -> float:
-    rgb, _ = baked.render(
+def rendered(baked: Baked, seen: View) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (N, 3) and opacities (N, 1 + L) of a view's pixels."""
+    return baked.render(
         seen.uv.reshape(-1, 2),
         seen.spread.reshape(-1, 2),
         seen.detail.ravel(),
@@ -292,6 +293,10 @@ def psnr(baked: Baked, seen: View) -> float:
         seen.origin,
         seen.directions.reshape(-1, 3),
     )
+
+
+def psnr(baked: Baked, seen: View) -> float:
+    rgb, _ = rendered(baked, seen)
     return float(-10 * np.log10(np.square(rgb.reshape(32, 32, 3) - seen.rgb / 255).mean()))
 
 
@@ -408,13 +413,6 @@ def test_rendering_is_the_baked_maps():
     scene = Scene(CONFIG, surroundings(), pixels)
     ours = scene.render(pixels)[0]
     seen = view(0.0)
-    rgb, opacity = scene.baked({}).render(
-        seen.uv.reshape(-1, 2),
-        seen.spread.reshape(-1, 2),
-        seen.detail.ravel(),
-        seen.hit.ravel(),
-        seen.origin,
-        seen.directions.reshape(-1, 3),
-    )
+    rgb, opacity = rendered(scene.baked({}), seen)
     assert np.abs(ours.reshape(-1, 3) - rgb).max() < 1e-5
     assert (opacity[seen.hit.ravel()] == [1, 0, 0, 0]).all() and (opacity[~seen.hit.ravel(), 0] == 0).all()
