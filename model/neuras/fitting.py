@@ -97,7 +97,7 @@ class Trainer:
         self.step += 1
         for name, (rows, leaf) in leaves.items():
             if len(rows):
-                scene.maps[name].update(rows, leaf.grad, share * config.lr, self.step)
+                scene.maps[name].update(rows, leaf.grad, share * config.lr * scene.rates[name], self.step)
 
     def means(self) -> dict[str, float]:
         """Mean losses since the last call."""

@@ -96,13 +96,13 @@ class Maps:
             found += table.values.index_select(0, cell.index_select(0, rows))
         return found
 
-    def update(self, rows: Tensor, gradient: Tensor, lr: float, step: int) -> None:
-        """A step of Adam on unique ``rows``, and on the cells that they lie in."""
-        self.fine.update(rows, gradient, lr, step)
+    def update(self, rows: Tensor, gradient: Tensor, rates: Tensor, step: int) -> None:
+        """A step of Adam on unique ``rows``, and on the cells that they lie in, at the ``rates`` (D,) of their channels."""
+        self.fine.update(rows, gradient, rates, step)
         for cell, table in self.coarse:
             cells, where = cell.index_select(0, rows).unique(return_inverse=True)
             total = torch.zeros(len(cells), gradient.shape[1], device=gradient.device).index_add_(0, where, gradient)
-            table.update(cells, total, lr, step)
+            table.update(cells, total, rates, step)
 
     def features_of_all(self) -> Tensor:
         """(R + M, D): of every touched texel, and the means that ``row_of`` refers to beside them."""

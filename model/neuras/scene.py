@@ -93,6 +93,7 @@ class Scene:
             torch.manual_seed(config.seed)
             self.mesh_shader = shading.MeshShader(config.shader).to(self.device)
             self.sky_shader = shading.SkyShader(config.shader).to(self.device)
+        self.rates = {name: _rates(shader.NAMED, config.shader.channels).to(self.device) for name, shader in self.shaders.items()}
         self.maps = self._start(pixels)
         self.codes: dict[str, Tensor] = {}
         if config.codes:
@@ -176,6 +177,10 @@ class Scene:
         light = shading.composite(colours.float().view(-1, self.layers, 3), opacities.float().view(-1, self.layers))
         return rgb.index_copy(0, rays[:: self.layers], light)
 
+    @property
+    def shaders(self) -> dict[str, shading.MeshShader | shading.SkyShader]:
+        return {"mesh": self.mesh_shader, "sky": self.sky_shader}
+
     def networks(self) -> list[Tensor]:
         return [*self.mesh_shader.parameters(), *self.sky_shader.parameters()]
 
@@ -224,3 +229,8 @@ class Scene:
             meta=meta,
             **arrays,
         )
+
+
+def _rates(named: int, channels: int) -> Tensor:
+    """(D,) shares of the learning rate."""
+    return torch.tensor([1.0 if channel < named else shading.QUIET for channel in range(channels)])

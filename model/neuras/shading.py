@@ -2,6 +2,10 @@
 
 They start as the identity on the first three channels, and a skybox's opacity as the sigmoid of the fourth: so the first
 picture is made of the colours that the texels start from. ReLU lets colours through, because they are not negative.
+
+Further channels learn at a share of the rate (``QUIET``), and the first layer's weights on them begin as many times larger. So
+they change the picture as fast as at the full rate, and stay small. Codes are chosen by distance, so they are spent on what is
+large: on colours.
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 COLOUR, OPACITY = slice(0, 3), 3  # channels of a feature at the start
+QUIET = 0.1  # how fast channels without such a meaning learn, beside those with one
 
 
 @dataclass(frozen=True)
@@ -28,11 +33,15 @@ class ShaderConfig:
 class MeshShader(nn.Module):
     """f_T of eq. 2."""
 
+    NAMED = 3  # channels that mean something at the start
+
     def __init__(self, config: ShaderConfig):
         super().__init__()
         self.view_direction = config.view_direction and config.layers > 0
         widths = [config.channels + 3 * self.view_direction, *[config.hidden] * (config.layers - 1), 3]
         self.layers = _layers(widths) if config.layers else nn.ModuleList()
+        for layer in self.layers[:1]:
+            _raise(layer, self.NAMED, config.channels)
 
     def forward(self, features: Tensor, directions: Tensor) -> Tensor:
         """Colours (N, 3) of features (N, D) seen along unit ``directions`` (N, 3)."""
@@ -41,6 +50,8 @@ class MeshShader(nn.Module):
 
 class SkyShader(nn.Module):
     """f_S of eq. 3: the first layer reads the feature alone and yields the opacity, so that does not depend on the view."""
+
+    NAMED = 4
 
     def __init__(self, config: ShaderConfig):
         super().__init__()
@@ -54,6 +65,7 @@ class SkyShader(nn.Module):
             self.opacity.bias.zero_()
             self.opacity.weight[0, OPACITY] = 1.0
             for layer in self.trunk:  # ReLU halves a number: one unit for each sign
+                _raise(layer, self.NAMED, config.channels)
                 layer.weight[OPACITY : OPACITY + 2] = 0
                 layer.bias[OPACITY : OPACITY + 2] = 0
                 layer.weight[OPACITY, OPACITY], layer.weight[OPACITY + 1, OPACITY] = 1.0, -1.0
@@ -91,6 +103,12 @@ def _layers(widths: list[int]) -> nn.ModuleList:
             layer.bias[COLOUR] = 0
             layer.weight[COLOUR, COLOUR] = torch.eye(3)
     return layers
+
+
+def _raise(layer: nn.Linear, first: int, last: int) -> None:
+    """Make the weights on the channels ``first`` to ``last`` larger, by as much as those channels learn more slowly."""
+    with torch.no_grad():
+        layer.weight[:, first:last] /= QUIET
 
 
 def _colour(layers: nn.ModuleList, x: Tensor) -> Tensor:

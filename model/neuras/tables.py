@@ -24,8 +24,9 @@ class Table:
         """(R, D), a view."""
         return self.packed[:, : self.width]
 
-    def update(self, rows: Tensor, gradient: Tensor, lr: float, step: int) -> None:
-        """One step of Adam on the unique ``rows`` (U,), with their ``gradient`` (U, D); ``step`` counts from 1, for all rows.
+    def update(self, rows: Tensor, gradient: Tensor, rates: Tensor, step: int) -> None:
+        """One step of Adam on the unique ``rows`` (U,), with their ``gradient`` (U, D), at the learning ``rates`` (D,);
+        ``step`` counts from 1, for all rows.
 
         As ``torch.optim.SparseAdam``: rows that are not named keep their moments too.
         """
@@ -36,5 +37,5 @@ class Table:
         second.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
         scale = (1 - beta2**step) ** 0.5
         denominator = second.sqrt().add_(EPSILON * scale)
-        value.addcdiv_(first, denominator, value=-lr * scale / (1 - beta1**step))
+        value.sub_((first / denominator).mul_(rates * (scale / (1 - beta1**step))))
         self.packed.index_copy_(0, rows, found)

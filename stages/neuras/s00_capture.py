@@ -56,7 +56,7 @@ class PandasetConfig(FolderConfig):
 
 class Capture(MapStage):
     name: ClassVar[str] = "capture"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     Config: ClassVar[Any] = Annotated[
         StreetCaptureConfig | NerfstudioConfig | ColmapConfig | PandasetConfig, Field(discriminator="name")
     ]

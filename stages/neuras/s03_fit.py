@@ -48,7 +48,7 @@ class FitStageConfig(StageConfig):
     sky_near_m: float = Field(150.0, gt=0)  # half size of the nearest skybox
     sky_far_m: float = Field(2400.0, gt=0)
     # Optimization
-    steps: int = Field(900, ge=1)
+    steps: int = Field(1500, ge=1)
     patch: int = Field(8, ge=2)  # pixels along a patch
     patches: int = Field(128, ge=1)  # of a step
     lr: float = Field(0.003, gt=0)  # of textures and codes
@@ -107,7 +107,7 @@ class FitStageConfig(StageConfig):
 
 class Fit(RunStage):
     name: ClassVar[str] = "fit"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas")
     Config: ClassVar[Any] = FitStageConfig
 

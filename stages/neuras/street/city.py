@@ -34,7 +34,8 @@ class Group:
     """All triangles of one material.
 
     vertices: (V, 3) float32, world. faces: (F, 3) int32. uvs: (V, 2) float32, v down. texture: (S, S, 3) uint8, sRGB.
-    kind: "matt", "gloss" (a clear coat over the texture) or "metal"; roughness: of the coat or metal.
+    kind: "matt", "satin" (paint, stone, leaves), "gloss" (a clear coat over the texture) or "metal"; roughness: of the coat,
+    sheen or metal.
     """
 
     name: str
@@ -130,13 +131,44 @@ def sky(rng: np.random.Generator, sun: np.ndarray, height: int = 512) -> np.ndar
     return np.where(d[..., 2:] < 0, ground, colours).astype(np.float32)
 
 
+MATT = ("grass", "gravel", "bark", "soil", "clay", "flowers", "cloth")
+SHEEN = {  # roughness of surfaces by the start of their names
+    "asphalt": 0.42,
+    "pavement": 0.42,
+    "kerb": 0.45,
+    "roof": 0.5,
+    "tyre": 0.4,
+    "leaves": 0.35,
+    "paint": 0.35,
+    "manhole": 0.25,
+    "pool": 0.05,
+}
+WALL_SHEEN = {
+    textures.brick: 0.5,
+    textures.plaster: 0.45,
+    textures.stone: 0.35,
+    textures.siding: 0.3,
+    textures.panels: 0.25,
+}
+
+
+def _finish(name: str, maker: Maker) -> tuple[str, float]:
+    """Kind and roughness of a surface. Few surfaces of a street are quite matt: asphalt, plaster and leaves shine at grazing
+    angles."""
+    if name.startswith(MATT):
+        return "matt", 0.5
+    if name.startswith("wall"):
+        return "satin", WALL_SHEEN[maker]
+    return "satin", next((roughness for start, roughness in SHEEN.items() if name.startswith(start)), 0.3)
+
+
 def _palette(rng: np.random.Generator) -> dict[str, tuple[Maker, str, float, float]]:
     """Each material: what makes its texture, its kind, its roughness, and its texture's size as a share of the largest."""
     t = textures
-    matt: dict[str, Maker] = {"asphalt": t.asphalt, "pavement": t.slabs, "grass": t.grass, "gravel": t.gravel}
+    large: dict[str, Maker] = {"asphalt": t.asphalt, "pavement": t.slabs, "grass": t.grass, "gravel": t.gravel}
     walls = [t.brick, t.plaster, t.stone, t.panels, t.plaster, t.brick, t.siding]
-    matt |= {f"wall{k}": walls[k % len(walls)] for k in range(WALLS)}
-    matt |= {f"roof{k}": t.tiles for k in range(ROOFS)}
+    large |= {f"wall{k}": walls[k % len(walls)] for k in range(WALLS)}
+    large |= {f"roof{k}": t.tiles for k in range(ROOFS)}
     small: dict[str, Maker] = {
         "bark": t.bark,
         "planks0": t.planks,
@@ -179,15 +211,15 @@ def _palette(rng: np.random.Generator) -> dict[str, tuple[Maker, str, float, flo
         t.hue(rng, (0, 1), (0.5, 0.9), (0.3, 0.8)),
         t.hue(rng, (0, 1), (0.3, 0.6), (0.3, 0.6)),
     ]
-    palette = {name: (maker, "matt", 0.5, 1.0) for name, maker in matt.items()}
-    palette |= {name: (maker, "matt", 0.5, 0.5) for name, maker in small.items()}
+    palette = {name: (maker, *_finish(name, maker), 1.0) for name, maker in large.items()}
+    palette |= {name: (maker, *_finish(name, maker), 0.5) for name, maker in small.items()}
     palette |= {
-        name: (t.atlas(draw), "matt", 0.5, 1.0)
-        for name, draw in (
-            ("posters", t.draw_poster),
-            ("signs", t.draw_sign),
-            ("towers", t.draw_tower),
-            ("plates", t.draw_plate),
+        name: (t.atlas(draw), "satin", roughness, 1.0)
+        for name, draw, roughness in (
+            ("posters", t.draw_poster, 0.25),
+            ("signs", t.draw_sign, 0.2),
+            ("towers", t.draw_tower, 0.15),
+            ("plates", t.draw_plate, 0.25),
         )
     }
     palette |= {name: (t.atlas(draw), "gloss", 0.05, 1.0) for name, draw in (("rooms", t.draw_window), ("goods", t.draw_shop))}

@@ -19,7 +19,7 @@ ABOVE = 1.9  # metres of the sensor above the road
 ELEVATION = (-25.0, 20.0)  # degrees, of the lowest and the highest beam
 REACH = {"street": 100.0, "drone": 180.0}  # metres
 NOISE = 0.02  # metres, standard deviation along a beam
-LOST = {"matt": 0.02, "gloss": 0.3, "metal": 0.1}  # share of beams that do not return
+LOST = {"matt": 0.02, "satin": 0.02, "gloss": 0.3, "metal": 0.1}  # share of beams that do not return
 RATE = 10.0  # turns a second
 
 

@@ -22,7 +22,7 @@ from stages.neuras.street.city import City, Group
 BOUNCES = 4  # segments of the longest path
 SUN = 3.4  # irradiance of a surface that faces the sun, before the exposure
 SUN_COLOUR = (1.0, 0.93, 0.8)
-INDEX = 1.9  # of refraction of glass and clear coats: higher than real, as panes have two sides
+INDEX = {"gloss": 1.9, "satin": 1.5}  # of refraction. Of glass it is higher than real, as panes have two sides
 EXPOSURE = 1.35
 LENS = 0.5  # pixels: deviation of the spot that a lens makes of a point. A box filter alone is sharper than any camera
 
@@ -117,11 +117,11 @@ def _shape(mi: Any, group: Group) -> Any:
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(group.texture)), "raw": False}
     if group.kind == "matt":
         surface: dict[str, Any] = {"type": "diffuse", "reflectance": texture}
-    elif group.kind == "gloss":
+    elif group.kind in INDEX:
         surface = {
             "type": "roughplastic",
             "diffuse_reflectance": texture,
-            "int_ior": INDEX,
+            "int_ior": INDEX[group.kind],
             "alpha": group.roughness,
             "nonlinear": False,
         }
