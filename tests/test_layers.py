@@ -43,6 +43,11 @@ stages.neuras.rasterizing
 stages.neuras.records
 stages.neuras
 stages
+stages.graphics.geometry.load  stages.graphics.geometry.side_files  stages.graphics.geometry.remesher  \
+stages.graphics.geometry.decimator  stages.graphics.geometry.sheet
+stages.graphics.geometry.formats
+stages.graphics.geometry.colours  stages.graphics.geometry.measure
+stages.graphics.geometry.records  stages.graphics.geometry.paths
 stages.graphics.geometry  stages.graphics.mitsuba  stages.graphics.statistics  stages.graphics.video  \
 stages.graphics.device  stages.graphics.denoising
 stages.graphics.metrics  stages.graphics.exr

@@ -69,7 +69,7 @@ class ObjaverseConfig(CollectConfig):
 
 class Collect(MapStage):
     name: ClassVar[str] = "collect"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     Config: ClassVar[Any] = Annotated[ProceduralConfig | FolderConfig | ObjaverseConfig, Field(discriminator="name")]
     reasons: ClassVar[dict[str, str]] = {
         "unreadable": "the file is truncated, malformed or not what its suffix says",
@@ -80,7 +80,9 @@ class Collect(MapStage):
         "no_faces": "there is no triangle in it",
         "not_finite": "a vertex in use is infinite or not a number",
         "bad_indices": "a face refers to a vertex that does not exist",
-        "degenerate": "no area, or an extent that is not sane",
+        "degenerate": "no triangle has an area, or the mesh is too small, or too far away, for its numbers",
+        "too_large_extent": "coordinates so large that lengths and areas cannot be computed",
+        "too_thin": "a hair or a sliver: next to no area for its length",
         "unavailable": "the source does not have an object of that id",
         "duplicate": "the same geometry as another object",
     }
@@ -279,32 +281,22 @@ def mesh_files(config: FolderConfig) -> list[str]:
 def _hashes(config: FolderConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
     """Content of all that decides the output: per mesh file its hash and those of the buffers, and with textures of
     the libraries and images, that it names; the README."""
-    from stages.graphics.geometry import load
+    from stages.graphics.geometry import side_files
+    from stages.graphics.geometry.paths import inside
 
     root = _folder(config)
 
     def content(relative: str) -> str:
-        return hash_file(root / relative) if load.inside(root / relative, root) else "outside"
+        return hash_file(root / relative) if inside(root / relative, root) else "outside"
 
     items: dict[str, Any] = {}
     for relative in mesh_files(config):
         path = root / relative
-        buffers = {}
-        if config.textures and load.inside(path, root):
-            from stages.graphics.geometry.colours import side_files
-
-            names = [target.resolve().relative_to(root.resolve()).as_posix() for target in side_files(path, root)]
-            buffers = {name: content(name) for name in names}
-        if path.suffix.lower() == ".gltf" and load.inside(path, root):
-            for uri in load.buffer_files(path):
-                try:
-                    target = load.check_path(uri, path.parent, root)
-                except Reject:
-                    continue  # the file that names it is rejected when it is read
-                if target.suffix.lower() == load.BUFFER_SUFFIX and target.is_file():
-                    name = target.resolve().relative_to(root.resolve()).as_posix()
-                    buffers[name] = content(name)
-        items[relative] = [content(relative), buffers] if buffers else content(relative)
+        beside: list[Path] = []
+        if inside(path, root):
+            beside = side_files.buffers(path, root) + (side_files.colours(path, root) if config.textures else [])
+        names = [target.resolve().relative_to(root.resolve()).as_posix() for target in beside]
+        items[relative] = [content(relative), {name: content(name) for name in names}] if names else content(relative)
     return {"items": items, "readme": content("README.md") if (root / "README.md").is_file() else None}
 
 
