@@ -80,7 +80,7 @@ class Collect(MapStage):
         "no_faces": "there is no triangle in it",
         "not_finite": "a vertex in use is infinite or not a number",
         "bad_indices": "a face refers to a vertex that does not exist",
-        "degenerate": "no triangle has an area, or the mesh is too small, or too far away, for its numbers",
+        "degenerate": "no area, or too small or too far from the origin for its numbers",
         "too_large_extent": "coordinates so large that lengths and areas cannot be computed",
         "too_thin": "a hair or a sliver: next to no area for its length",
         "unavailable": "the source does not have an object of that id",

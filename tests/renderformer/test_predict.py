@@ -402,7 +402,7 @@ def bad_scenes() -> dict:
 
     return {
         "gone.obj does not exist": missing_mesh,
-        "vertex 1 of": nan_vertex,
+        "nan.obj: line 2: a coordinate": nan_vertex,
         "has no light": without_light,
         "has no camera": no_camera,
     }

@@ -29,6 +29,14 @@ def face_normals(corners: np.ndarray) -> np.ndarray:
     return np.where(length > 0, vectors / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
 
 
+def have_area(corners: np.ndarray) -> np.ndarray:
+    """(F,) bool of (F, 3, 3) float32 triangles: those wider than a few roundings of their coordinates."""
+    corners = np.asarray(corners, np.float64)
+    longest = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
+    rounding = 4 * np.finfo(np.float32).eps * np.abs(corners).max(axis=(1, 2))
+    return np.linalg.norm(normal_vectors(corners), axis=1) > longest * rounding
+
+
 def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F, 3): ``normal_vectors`` of a mesh."""
     return normal_vectors(corners_of(vertices, faces))

@@ -169,13 +169,14 @@ def predict(
     renderer: Renderer, path: Path | str, output: Output, settings: PredictSettings | None = None, room: Room | None = None
 ) -> list[Path]:
     """Render a scene or mesh file (``lightmill predict``); returns the files written. Notes and warnings go to stderr."""
+    from stages.renderformer.inference.scene_files import print_notes
+
     settings = settings or PredictSettings()
     scene, views = settings.apply(renderer.load(path, room))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", LimitWarning)
         images = renderer.frames(scene, views, settings.resolution, settings.composite_lights)
-    for note in scene.meta.get("notes", ()):
-        print(f"note: {note}", file=sys.stderr)
+    print_notes(scene)
     for warning in caught:
         print(f"warning: {warning.message}", file=sys.stderr)
     return output.write(images, settings.one_image)

@@ -7,6 +7,7 @@ commands refuse it alike.
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 from pipeline.errors import UserError
@@ -43,4 +44,11 @@ def load_scene(path: Path | str, room: Room | None = None) -> SceneRecord:
 def check_lit(scene: SceneRecord, name: Path | str) -> None:
     """UserError, with the scene's ``name``, if nothing in it emits."""
     if not scene.emission.any():
-        raise UserError(f"{name} has no light, its picture would be black: give an object an emissive colour above 0")
+        why = "".join(f" ({note})" for note in scene.meta.get("notes", ()) if "without area" in note)
+        raise UserError(f"{name} has no light{why}, its picture would be black: give an object an emissive colour above 0")
+
+
+def print_notes(scene: SceneRecord) -> None:
+    """Say on stderr what was done to the file to make it a scene."""
+    for note in scene.meta.get("notes", ()):
+        print(f"note: {note}", file=sys.stderr)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import Reject, UserError
-from stages.graphics.geometry.measure import face_normals
+from stages.graphics.geometry.measure import face_normals, have_area
 from stages.renderformer.records import PATCH_CHANNELS, PATCH_KEPT, PATCH_SIDE, TEXTURED_CHANNELS, SceneRecord, patch_means
 from stages.renderformer.scenes.assemble import rotation_matrix
 
@@ -78,7 +78,7 @@ def load_json(path: Path) -> SceneRecord:
             "object_index",
         )
     }
-    objects, lights = [], 0
+    objects, notes, lights = [], [], 0
     for index, (name, entry) in enumerate(data["objects"].items()):
         where = f"{path}: object {name!r}"
         if not isinstance(entry, dict):
@@ -90,6 +90,9 @@ def load_json(path: Path) -> SceneRecord:
         count = len(triangles)
         emission = _numbers(material, "emissive", (0, 0, 0), where, low=0)
         emits = bool(emission.max() > 0)
+        if emits and not have_area(triangles.astype(np.float32)).any():
+            notes.append(f"{name}: a light without area adds nothing")
+            emission, emits = np.zeros(3), False
         values = {
             "triangles": triangles,
             "vertex_normals": normals,
@@ -111,6 +114,7 @@ def load_json(path: Path) -> SceneRecord:
         "law": "released",
         "scene_name": str(data.get("scene_name", path.stem)),
         "objects": objects,
+        **({"notes": notes} if notes else {}),
     }
     return SceneRecord(
         path.stem, **arrays, camera_to_world=np.stack(poses).astype(np.float32), fov_deg=np.float32(fovs), meta=meta
@@ -270,6 +274,13 @@ def load_hdf5(path: Path) -> SceneRecord:
     channel = {name: arrays["texture"][:, part] for name, part in PATCH_CHANNELS.items()}
     triangles = arrays["triangles"]
     light_index = _light_groups(triangles, channel["emission"].max(axis=1) > 0)
+    notes, emission = [], channel["emission"]
+    wide = np.bincount(light_index[light_index >= 0], have_area(triangles)[light_index >= 0]) > 0  # lights with an area
+    if not wide.all():
+        notes = [f"{int((~wide).sum())} of {len(wide)} lights: a light without area adds nothing"]
+        lit = (light_index >= 0) & wide[light_index] if wide.any() else np.zeros(len(triangles), bool)
+        emission = np.where(lit[:, None], emission, 0)
+        light_index = _light_groups(triangles, lit)
     lights = int(light_index.max(initial=-1)) + 1
     objects = [{"name": "surface", "kind": "object", "faces": int((light_index < 0).sum())}]
     objects += [
@@ -282,12 +293,18 @@ def load_hdf5(path: Path) -> SceneRecord:
         channel["diffuse"],
         channel["specular"],
         np.maximum(channel["roughness"][:, 0], MIN_ROUGHNESS),
-        channel["emission"],
+        emission,
         light_index,
         (light_index + 1).astype(np.int16),
         arrays["c2w"],
         arrays["fov"],
-        {"template": "released", "law": "released", "scene_name": path.stem, "objects": objects},
+        {
+            "template": "released",
+            "law": "released",
+            "scene_name": path.stem,
+            "objects": objects,
+            **({"notes": notes} if notes else {}),
+        },
         patch_index,
         patches,
     )

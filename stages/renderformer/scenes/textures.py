@@ -120,6 +120,7 @@ def nearest_colours(
     vertices = np.ascontiguousarray(vertices, np.float64)
     faces = np.ascontiguousarray(faces[visible], np.int64)
     material, uv = texture.material[visible].astype(np.int64), texture.uv[visible].astype(np.float64)
+    tint = None if texture.tint is None else texture.tint[visible]
     corners = vertices[faces]
     tree = igl.AABB()
     tree.init(vertices, faces)
@@ -135,6 +136,8 @@ def nearest_colours(
             of_look = look == row
             if of_look.any():
                 out[of_look] *= look_up(texture.images[texture.image[row]], where[of_look], tuple(texture.wrap[row]))
+        if tint is not None:
+            out *= np.einsum("nk,nkc->nc", place, tint[face]).astype(np.float32)
         return out
 
     return colours

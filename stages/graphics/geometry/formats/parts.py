@@ -18,7 +18,8 @@ class Source:
 
     path: the file. root: nothing outside it is read. max_bytes: of a file beside it, and of arrays that the file only states.
     max_faces: that the file may state. images: collects base-colour images; None where colours are not asked for.
-    about: origin and licence where the file states them. references: files that it names and its triangles do not need. notes: what of the colours could not be had, and why.
+    about: origin and licence where the file states them. references: files that it names, though no triangle needs them.
+    notes: what of the colours could not be had, and why.
     """
 
     path: Path
