@@ -19,6 +19,7 @@ from stages.renderformer.inference.room import SPECULAR, Room, room_scene
 from stages.renderformer.inference.scene_files import load_scene
 from stages.renderformer.s00_collect import Collect
 from stages.renderformer.scenes import textures
+from tests.graphics.habits import HABITS
 from tests.graphics.malformed import MALFORMED
 
 CLASSES = re.compile(r"\b\w*(?:Error|Exception|Warning)\b|Traceback|NoneType|object has no|not subscriptable")
@@ -73,14 +74,17 @@ def test_reported_files_have_their_extents_and_are_closed(name: str, shared_data
 
 
 def test_the_reported_boxes_are_duplicates_of_one_another(shared_data: Path) -> None:
-    boxes = [path for path in sorted((shared_data / "cases" / "12-text-formats").glob("*.*")) if path.suffix in (".off", ".ply")]
+    boxes = [
+        path for path in sorted((shared_data / "cases" / "12-text-formats").glob("*.*")) if path.suffix in (".off", ".ply")
+    ]
     signatures = [measure.signature(load.normalise(m.vertices), m.faces) for m in map(mesh_of, boxes) if len(m.faces) == 12]
     assert len(signatures) == 4 and np.ptp(signatures, axis=0).max() < 1e-5
 
 
 COLOURS = {
     "factor-0.0005": (0.0005, 0.002, 0.003), "factor-0.003": (0.003,) * 3, "factor-0.8": (0.8, 0.4, 0.1),
-    "factor-absent": (1, 1, 1), "factor-int-ones": (1, 1, 1), "factor-int-zero-one": (0, 1, 0), "factor-over-one": (1, 0.5, 0.5),
+    "factor-absent": (1, 1, 1), "factor-int-ones": (1, 1, 1), "factor-int-zero-one": (0, 1, 0),
+    "factor-over-one": (1, 0.5, 0.5),
     "metal": (0.9, 0.7, 0.2), "specular-glossiness": (0.05, 0.3, 0.05),
 }  # fmt: skip
 
@@ -139,3 +143,51 @@ def test_objects_without_area_stay_finite(name: str, shared_data: Path) -> None:
     scene = load_scene(shared_data / "cases" / "5-zero-area" / f"{name}.json")
     assert all(np.isfinite(array).all() for array in scene.arrays().values())
     assert np.allclose(np.linalg.norm(scene.vertex_normals, axis=2), 1, atol=1e-3)
+
+
+# -- habits of exporters
+
+
+@pytest.mark.parametrize("name", HABITS)
+def test_a_box_is_the_same_box_however_it_is_written(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(HABITS[name])
+    mesh = mesh_of(tmp_path / name, textures=True)
+    assert len(mesh.faces) == 12 and np.ptp(mesh.vertices, axis=0) == pytest.approx([2, 1, 0.5])
+    assert measure.volume(mesh.vertices, mesh.faces) == pytest.approx(1)
+    points, index = np.unique(mesh.vertices.round(6), axis=0, return_inverse=True)
+    assert len(points) == 8 and measure.watertight(index.reshape(-1)[mesh.faces], 8)
+
+
+def test_polygons_become_triangles_whatever_their_number_of_corners(tmp_path: Path) -> None:
+    """A prism over a regular polygon: OBJ, OFF and PLY agree, and its volume is the polygon's area times the height."""
+    for corners in (3, 5, 6, 9):
+        angle = 2 * np.pi * np.arange(corners) / corners
+        ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        points = np.concatenate([np.c_[ring, 0 * angle], np.c_[ring, 0 * angle + 1]])
+        ring = np.arange(corners)
+        sides = np.stack([ring, np.roll(ring, -1), np.roll(ring, -1) + corners, ring + corners], axis=1).tolist()
+        faces = [ring[::-1].tolist(), (ring + corners).tolist(), *sides]
+        rows = "".join(" ".join(map(repr, p.tolist())) + "\n" for p in points)
+        lists = "".join(" ".join(map(str, [len(f), *f])) + "\n" for f in faces)
+        (tmp_path / "a.off").write_text(f"OFF\n{len(points)} {len(faces)} 0\n{rows}{lists}")
+        (tmp_path / "a.obj").write_text(
+            "".join(f"v {row}\n" for row in rows.splitlines())
+            + "".join("f " + " ".join(str(i + 1) for i in f) + "\n" for f in faces)
+        )
+        head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n" + "".join(f"property double {a}\n" for a in "xyz")
+        head += f"element face {len(faces)}\nproperty list uchar int vertex_index\nend_header\n"
+        (tmp_path / "a.ply").write_text(head + rows + lists)
+        for name in ("a.off", "a.obj", "a.ply"):
+            mesh = mesh_of(tmp_path / name)
+            assert measure.volume(mesh.vertices, mesh.faces) == pytest.approx(corners / 2 * np.sin(2 * np.pi / corners))
+            assert measure.watertight(mesh.faces, len(mesh.vertices)), (name, corners)
+
+
+def test_triangle_strips_of_ply_are_read(tmp_path: Path) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 6\n" + "".join(f"property float {a}\n" for a in "xyz")
+    head += "element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    points = "".join(f"{x} {y} 0\n" for x in (0, 1, 2) for y in (0, 1))
+    (tmp_path / "a.ply").write_text(head + points + "7 0 2 1 3 -1 2 4 \n".replace("7", "9").replace("4 ", "4 3 5"))
+    mesh = mesh_of(tmp_path / "a.ply")
+    corners = mesh.vertices[mesh.faces]
+    assert len(corners) == 4 and (measure.normal_vectors(corners)[:, 2] > 0).all()
