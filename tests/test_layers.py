@@ -30,6 +30,7 @@ stages.renderformer.s05_shard  stages.renderformer.s06_train  stages.renderforme
 stages.renderformer.probes
 stages.renderformer.evaluation
 stages.renderformer.inference
+stages.renderformer.importing
 stages.renderformer.rendering
 stages.renderformer.dataset  stages.renderformer.scenes  stages.renderformer.objects
 stages.renderformer.views

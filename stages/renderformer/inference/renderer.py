@@ -116,8 +116,8 @@ class Renderer:
     ) -> Iterator[np.ndarray]:  # fmt: skip
         """(H, W, 3) float32 linear radiance of each of the cameras ``views`` (None: all), in order, rendered when asked for.
 
-        resolution: pixels per side, or (height, width), multiples of 8 (of 64 with a Swin view stage). None: what the
-            network was trained with.
+        resolution: pixels of the longer side, or (height, width), multiples of 8 (of 64 with a Swin view stage). None: what
+            the network was trained with. All pictures are as wide as the first camera's.
         composite_lights: one pass per light, summed. Light transport is linear, so the sum is exact for a path tracer. A
             network can render more lights in this way than it was trained with.
 
@@ -135,7 +135,10 @@ class Renderer:
                 raise UserError(f"view {view} of {scene.id} does not exist: it has cameras 0 to {count - 1}")
         if composite_lights:
             check_lit(scene, scene.id)
-        size = self._size(self.resolution if resolution is None else resolution)
+        resolution = self.resolution if resolution is None else resolution
+        if isinstance(resolution, int) and len(views):
+            resolution = scene.picture_size(views[0], resolution, self.model.config.resolution_multiple)
+        size = self._size(resolution)
         for sentence in beyond_limits(scene, views, size, self.trained_with, composite_lights):
             warnings.warn(f"{scene.id}: {sentence}", LimitWarning, stacklevel=2)
         return self._frames(scene, views, size, composite_lights)

@@ -1,6 +1,7 @@
 """Scene and mesh files as scenes, for trace, predict and compare.
 
-Reads the released formats (``stages.renderformer.scenes.released``) as they are. A plain mesh gets a room around it
+Reads the released formats (``stages.renderformer.scenes.released``) as they are. A file of a modelling tool with cameras and
+lights is a scene, too (``stages.renderformer.importing``). A plain mesh gets a room around it
 (``stages.renderformer.inference.room``). One design choice: a file that cannot give a picture is refused here, so that all
 commands refuse it alike.
 """
@@ -21,8 +22,10 @@ MESHES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 def load_scene(path: Path | str, room: Room | None = None) -> SceneRecord:
     """The file as a SceneRecord with at least one camera and one light. A UserError says what is wrong with it.
 
-    ``room`` is what a mesh gets around it, ``Room()`` if None. A scene file is taken as it is.
+    ``room`` is what a mesh gets around it, ``Room()`` if None. A scene file is taken as it is. A glTF that has cameras and
+    lights is one, unless the room's template or axis is chosen.
     """
+    from stages.renderformer.importing.convert import ImportSettings, holds_scene, import_scene
     from stages.renderformer.inference.room import room_scene
     from stages.renderformer.scenes import released
 
@@ -35,7 +38,10 @@ def load_scene(path: Path | str, room: Room | None = None) -> SceneRecord:
     if not path.is_file():
         raise UserError(f"{path} does not exist: give a scene or mesh file")
     if suffix in MESHES:
-        return room_scene(path, room or Room())
+        room = room or Room()
+        if room.template is None and room.up is None and holds_scene(path):
+            return import_scene(path, ImportSettings(room.triangles))
+        return room_scene(path, room)
     scene = released.load_scene(path)
     check_lit(scene, path)
     return scene

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -45,9 +47,13 @@ def trace(
         raise UserError(f"view={view} does not exist: {scene_path} has {count} camera(s), counted from 0; or give 'all'")
     print_notes(scene)
     chosen = choose(backend)
+    for note in scene.meta.get("notes", ()):
+        print(f"note: {note}", file=sys.stderr)
     paths = []
     for index in range(count) if view == "all" else [view]:
-        (record,) = render_views(scene, settings, chosen, [index])
+        given = settings.resolution
+        size = scene.picture_size(index, given) if isinstance(given, int) else given
+        (record,) = render_views(scene, replace(settings, resolution=size), chosen, [index])
         paths.append(out.with_name(f"{out.stem}-{index}{out.suffix}") if view == "all" else out)
         write_rgb(paths[-1], record.image)
     return paths

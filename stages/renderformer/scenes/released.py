@@ -108,6 +108,7 @@ def load_json(path: Path) -> SceneRecord:
         lights += emits
         objects.append({"name": str(name), "kind": "light" if emits else "object", "faces": count})
     poses, fovs = zip(*[_camera(camera, f"{path}: camera {index}") for index, camera in enumerate(cameras)], strict=True)
+    aspects = [_aspect(camera, f"{path}: camera {index}") for index, camera in enumerate(cameras)]
     arrays = {name: np.concatenate(parts).astype(SceneRecord.DTYPES[name]) for name, parts in columns.items()}
     meta = {
         "template": "released",
@@ -115,6 +116,7 @@ def load_json(path: Path) -> SceneRecord:
         "scene_name": str(data.get("scene_name", path.stem)),
         "objects": objects,
         **({"notes": notes} if notes else {}),
+        **({} if aspects == [1.0] * len(aspects) else {"aspect": aspects}),
     }
     return SceneRecord(
         path.stem, **arrays, camera_to_world=np.stack(poses).astype(np.float32), fov_deg=np.float32(fovs), meta=meta
@@ -241,6 +243,14 @@ def _camera(camera: Any, where: str) -> tuple[np.ndarray, float]:
     return pose, fov
 
 
+def _aspect(camera: dict[str, Any], where: str) -> float:
+    """Width over height of the picture: an entry of ours, which other readers pass over."""
+    aspect = _numbers(camera, "aspect", 1.0, where)
+    if not 0.01 <= aspect <= 100:
+        raise UserError(f"{where}: aspect is {aspect}, expected width over height")
+    return aspect
+
+
 # --- HDF5 -------------------------------------------------------------------------------------------------------------
 
 
@@ -256,6 +266,7 @@ def load_hdf5(path: Path) -> SceneRecord:
                 raise UserError(f"{path} has no dataset {', '.join(missing)}: expected {', '.join(shapes)}")
             arrays = {name: _dataset(file, name, path).astype(np.float32) for name in shapes if name != "texture"}
             texture = _dataset(file, "texture", path)
+            aspects = np.atleast_1d(np.asarray(file["fov"].attrs.get("aspect", []), np.float64))
     except (OSError, RuntimeError, KeyError) as error:
         raise UserError(f"{path} is not an HDF5 file that can be read ({error})") from error
     patch_index, patches = None, None
@@ -304,6 +315,7 @@ def load_hdf5(path: Path) -> SceneRecord:
             "scene_name": path.stem,
             "objects": objects,
             **({"notes": notes} if notes else {}),
+            **({"aspect": aspects.tolist()} if len(aspects) == len(arrays["fov"]) and (aspects > 0.01).all() else {}),
         },
         patch_index,
         patches,
