@@ -58,6 +58,7 @@ model.renderformer  model.neuras
 model.training
 model.lpips  model.inception  model.timing
 model.weights
+model.file_kinds
 model.errors
 model
 pipeline.__main__  pipeline.job  pipeline.commands

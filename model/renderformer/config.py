@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from model.errors import InputError
+from model.file_kinds import wrong_kind
 
 # Fields of the released format that have one supported value. They are kept so that folders are written back complete.
 FIXED: dict[str, Any] = {
@@ -168,11 +169,11 @@ class ModelConfig:
     @classmethod
     def load(cls, path: Path) -> ModelConfig:
         try:
-            data = json.loads(path.read_text())
+            data = json.loads(path.read_text(encoding="utf-8-sig"))  # some editors begin a file with a byte order mark
         except FileNotFoundError:
             raise InputError(f"{path} is missing: a checkpoint folder holds config.json and model.safetensors") from None
         except ValueError as error:
-            raise InputError(f"{path} is not JSON: {error}") from None
+            raise InputError(f"{path} {wrong_kind(path) or f'is not JSON: {error}'}") from None
         if not isinstance(data, dict):
             raise InputError(f"{path} must hold one JSON object")
         return cls.from_dict(data, str(path))
