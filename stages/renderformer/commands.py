@@ -219,11 +219,11 @@ def add_commands(parsers: Any, program: str) -> None:
 
     sub = add(
         "import", command_import,
-        "a scene of a modelling tool (glTF) as a scene file, or a folder of scene files as scenes to render",
+        "a scene of a modelling tool (glTF, USD) as a scene file, or a folder of scene files as scenes to render",
         f"scene.glb -o scene.h5   |   {program} import scenes scene.split=test   (then: stage=render scene=imported ..)",
     )  # fmt: skip
     sub.add_argument("source", metavar="SCENE | FOLDER",
-                     help="a .glb or .gltf; or a folder of released JSON and HDF5 scenes: train/, validation/ and test/ "
+                     help="a .glb, .gltf or .usd*; or a folder of released JSON and HDF5 scenes: train/, validation/ and test/ "
                      "in it are splits")  # fmt: skip
     sub.add_argument("-o", "--out", help="of a scene: OUT.json (its meshes in OUT-meshes/) or OUT.h5")
     sub.add_argument("--triangles", type=int, metavar="N", default=4096,
@@ -245,7 +245,9 @@ def add_commands(parsers: Any, program: str) -> None:
         sub.add_argument("-o", "--out", help="folder of table.md, table.json and table.png (default: runs/TABLE)")
         sub.usage = f"{program} {name} [TABLE] [--rows ROW,...] [-o FOLDER] [name=value ...] [--debug]"
 
-    scene_help = "scene file in a released format (.json, .h5), or a mesh (.glb, .gltf, .obj, .off, .ply, .stl)"
+    scene_help = (
+        "scene file in a released format (.json, .h5), or a mesh or scene (.glb, .gltf, .usd*, .obj, .off, .ply, .stl, ..)"
+    )
 
     def add_mesh_options(sub: argparse.ArgumentParser, triangles: str) -> None:
         group = sub.add_argument_group("a mesh gets a room, lights and a camera")

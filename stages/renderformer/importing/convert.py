@@ -14,8 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import UserError
+from stages.graphics.geometry.load import EXPORTS
 from stages.graphics.geometry.measure import face_normals
-from stages.renderformer.importing import gltf
+from stages.graphics.geometry.usd import SUFFIXES
+from stages.renderformer.importing import gltf, usd
 from stages.renderformer.importing.bodies import Body, fit, subdivide
 from stages.renderformer.importing.described import Described, Lamp, Part, Viewpoint
 from stages.renderformer.records import SceneRecord
@@ -25,9 +27,10 @@ from stages.renderformer.scenes.lamps import LIGHT_AREA, LIGHT_DISTANCE, LIGHT_R
 from stages.renderformer.scenes.laws import LARGEST_TRIANGLE, Camera, LightLaw
 
 # By suffix: whether a file is a scene, and what it describes.
-READERS: Mapping[str, tuple[Callable[[Path], bool], Callable[[Path], Described]]] = dict.fromkeys(
-    (".glb", ".gltf"), (gltf.holds_scene, gltf.read_gltf)
-)
+READERS: Mapping[str, tuple[Callable[[Path], bool], Callable[[Path], Described]]] = {
+    **dict.fromkeys((".glb", ".gltf"), (gltf.holds_scene, gltf.read_gltf)),
+    **dict.fromkeys(SUFFIXES, (usd.holds_scene, usd.read_usd)),
+}
 FAR = LightLaw().distance[1]  # scene units: where a directional light stands
 STAND_IN_FOV_DEG = 40.0  # of the camera that a file without one gets, and of one that stands for an orthographic camera
 STAND_IN_DIRECTION = -0.55, -1.0, 0.65  # to that camera, from the middle
@@ -62,7 +65,8 @@ def holds_scene(path: Path) -> bool:
 def import_scene(path: Path, settings: ImportSettings | None = None) -> SceneRecord:
     """The scene that a file describes. UserError says what is wrong with it."""
     if path.suffix.lower() not in READERS:
-        raise UserError(f"{path} is no scene of a kind that is imported ({', '.join(READERS)}): export it as glTF (.glb)")
+        advice = EXPORTS.get(path.suffix.lower(), "export glTF (.glb)")
+        raise UserError(f"{path} is no scene of a kind that is imported ({', '.join(READERS)}): {advice}")
     _, read = READERS[path.suffix.lower()]
     return converted(path, read(path), settings or ImportSettings())
 

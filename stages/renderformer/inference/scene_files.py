@@ -12,11 +12,12 @@ import sys
 from pathlib import Path
 
 from pipeline.errors import UserError
+from stages.graphics.geometry.load import EXPORTS
+from stages.graphics.geometry.load import SUFFIXES as MESHES
 from stages.renderformer.inference.room import Room
 from stages.renderformer.records import SceneRecord
 
 SCENES = (".json", ".h5", ".hdf5")
-MESHES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 
 
 def load_scene(path: Path | str, room: Room | None = None) -> SceneRecord:
@@ -31,6 +32,8 @@ def load_scene(path: Path | str, room: Room | None = None) -> SceneRecord:
 
     path = Path(path)
     suffix = path.suffix.lower()
+    if suffix in EXPORTS:
+        raise UserError(f"{path} is of a kind that is not read: {EXPORTS[suffix]}")
     if suffix not in SCENES + MESHES:
         raise UserError(
             f"{path} is neither a scene nor a mesh: expected {', '.join(SCENES)} (the released formats) or {', '.join(MESHES)}"
