@@ -75,6 +75,7 @@ class Collect(MapStage):
         "unreadable": "the file is truncated, malformed or not what its suffix says",
         "unsupported": "the file requires a feature that is not supported",
         "needs_draco": "the file requires Draco compression and the package DracoPy is not installed",
+        "needs_package": "the file's format is read by a package that is not installed",
         "unsafe_path": "the file refers to, or is, something outside its folder",
         "too_large": "the file, or the geometry that it states, is over the configured limits",
         "no_faces": "there is no triangle in it",
@@ -261,20 +262,24 @@ def _folder(config: FolderConfig) -> Path:
 
 def mesh_files(config: FolderConfig) -> list[str]:
     """Relative POSIX paths of the mesh files below the folder, sorted. Linked folders are not entered."""
-    from stages.graphics.geometry.load import SUFFIXES
+    from stages.graphics.geometry.load import EXPORTS, SUFFIXES
 
     root = _folder(config)
-    mesh_paths = []
+    mesh_paths, exports = [], set()
     for folder, folders, files in os.walk(root):
         folders.sort()
         for name in files:
             relative = (Path(folder) / name).relative_to(root)
+            exports |= {relative.suffix.lower()} & EXPORTS.keys()
             if relative.suffix.lower() in SUFFIXES and (
                 config.pattern == "**/*" or PurePosixPath(relative.as_posix()).match(config.pattern)
             ):
                 mesh_paths.append(relative.as_posix())
     if not mesh_paths:
-        raise UserError(f"collect.path={config.path!r} holds no mesh matching {config.pattern!r} ({', '.join(SUFFIXES)})")
+        hints = "".join(f"; {suffix} is not read: {EXPORTS[suffix]}" for suffix in sorted(exports))
+        raise UserError(
+            f"collect.path={config.path!r} holds no mesh matching {config.pattern!r} ({', '.join(SUFFIXES)}){hints}"
+        )
     return sorted(mesh_paths)
 
 
@@ -294,7 +299,11 @@ def _hashes(config: FolderConfig, hash_file: Callable[[Any], str]) -> dict[str, 
         path = root / relative
         beside: list[Path] = []
         if inside(path, root):
-            beside = side_files.buffers(path, root) + (side_files.colours(path, root) if config.textures else [])
+            beside = (
+                side_files.buffers(path, root)
+                + side_files.layers(path, root)
+                + (side_files.colours(path, root) if config.textures else [])
+            )
         names = [target.resolve().relative_to(root.resolve()).as_posix() for target in beside]
         items[relative] = [content(relative), {name: content(name) for name in names}] if names else content(relative)
     return {"items": items, "readme": content("README.md") if (root / "README.md").is_file() else None}

@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.errors import Reject
 from stages.graphics.geometry import colours
-from stages.graphics.geometry.formats import gltf_mesh, obj, off, ply, stl
+from stages.graphics.geometry.formats import by_trimesh, gltf_mesh, obj, off, ply, stl, usd
 from stages.graphics.geometry.formats.faults import at
 from stages.graphics.geometry.formats.parts import Part, Source
 from stages.graphics.geometry.measure import normal_vectors
@@ -31,7 +31,21 @@ READERS: dict[str, Callable[[bytes, Source], list[Part]]] = {
     ".ply": ply.read,
     ".stl": stl.read,
 }
+PLAIN = tuple(READERS)  # read without optional packages
+READERS |= dict.fromkeys(by_trimesh.PACKAGES, by_trimesh.read) | dict.fromkeys(usd.SUFFIXES, usd.read)
 SUFFIXES = tuple(READERS)  # what is looked for in a folder
+# What is not read, and the export to choose in the program that wrote it.
+EXPORTS = {
+    ".fbx": "export glTF (.glb) instead, in Blender: File > Export > glTF 2.0",
+    ".blend": "open it in Blender, and choose File > Export > glTF 2.0 (.glb), with cameras and punctual lights for a scene",
+    ".max": "export glTF (.glb) or USD instead",
+    ".ma": "export glTF (.glb) or USD instead",
+    ".mb": "export glTF (.glb) or USD instead",
+    ".3ds": "export glTF (.glb) or OBJ instead",
+    ".abc": "export USD or glTF (.glb) instead",
+    ".step": "export STL or glTF (.glb) instead",
+    ".stp": "export STL or glTF (.glb) instead",
+}
 LARGEST = 1e12  # of a coordinate, in the file's own units: beyond, squares of lengths leave the range of float32
 SMALLEST = 1e-12  # of the longest side
 DIGITS = 1e-6  # longest side, of the largest coordinate: below, a float32 file has less than one digit left for the shape

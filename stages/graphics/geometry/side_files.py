@@ -1,4 +1,4 @@
-"""The files beside a mesh file that decide what is made of it: buffers of glTF; for colours, libraries and images."""
+"""The files beside a mesh file that decide what is made of it: buffers, layers of USD; for colours, libraries and images."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from pipeline.errors import Reject
 from stages.graphics.geometry.colours import IMAGE_FORMATS, side_file
-from stages.graphics.geometry.formats import mtl, obj
+from stages.graphics.geometry.formats import mtl, obj, usd
 from stages.graphics.geometry.formats.faults import at
 from stages.graphics.geometry.formats.gltf import BUFFER_SUFFIX
 from stages.graphics.geometry.formats.json_values import items, parse
@@ -19,6 +19,17 @@ from stages.graphics.geometry.formats.parts import Source
 def buffers(path: Path, root: Path) -> list[Path]:
     """The files that a glTF keeps its buffers in; what is unsafe or missing is left out, as it is rejected when read."""
     return _known(path, root, ((uri, (BUFFER_SUFFIX,)) for uri in _uris(path, "buffers")))
+
+
+def layers(path: Path, root: Path) -> list[Path]:
+    """The layers that a USD file is composed of; [] where it may not or cannot be read."""
+    if path.suffix.lower() not in usd.SUFFIXES:
+        return []
+    try:
+        with at(path.name):
+            return usd.layers(path, root)
+    except Reject:
+        return []
 
 
 def colours(path: Path, root: Path) -> list[Path]:

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import UserError
+from stages.graphics.geometry.formats.usd import SUFFIXES
 from stages.graphics.geometry.load import EXPORTS
 from stages.graphics.geometry.measure import face_normals
-from stages.graphics.geometry.usd import SUFFIXES
 from stages.renderformer.importing import gltf, usd
 from stages.renderformer.importing.bodies import Body, fit, subdivide
 from stages.renderformer.importing.described import Described, Lamp, Part, Viewpoint

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import Reject, UserError
-from stages.graphics.geometry import colours, usd
+from stages.graphics.geometry import colours
+from stages.graphics.geometry.formats import usd
+from stages.graphics.geometry.formats.faults import at
 from stages.renderformer.importing.described import (
     MAX_BYTES,
     MAX_FACES,
@@ -31,7 +33,8 @@ DISK_SIDES = 16
 def holds_scene(path: Path) -> bool:
     """Whether the file has a camera and a light, so that it is a scene and no mere mesh. False where it cannot be read."""
     try:
-        stage = usd.open_stage(path, path.parent)
+        with at(path.name):
+            stage = usd.open_stage(path, path.parent)
     except Reject:
         return False
     from pxr import UsdGeom, UsdLux
@@ -44,8 +47,9 @@ def read_usd(path: Path) -> Described:
     """The stage's scene. UserError says what is wrong with it."""
     images = colours.Images()
     try:
-        stage = usd.open_stage(path, path.parent)
-        parts = list(usd.parts(stage, path.parent, MAX_BYTES, MAX_FACES, images))
+        with at(path.name):
+            stage = usd.open_stage(path, path.parent)
+            parts = list(usd.parts(stage, path.parent, MAX_BYTES, MAX_FACES, images))
     except Reject as error:
         raise UserError(f"{path} cannot be read: {error.detail or error.reason}") from None
     from pxr import Usd, UsdGeom

@@ -176,12 +176,12 @@ def _mesh(folder: Path, entry: dict[str, Any], smooth: bool, where: str) -> tupl
 def _arrays(path: Path, where: str) -> tuple[np.ndarray, np.ndarray]:
     """(V, 3) float64 vertices and (F, 3) faces of a mesh file, as they are."""
     from stages.graphics.geometry.formats.parts import Source
-    from stages.graphics.geometry.load import SUFFIXES, read_parts
+    from stages.graphics.geometry.load import PLAIN, read_parts
 
     if not path.is_file():
         raise UserError(f"{where}: mesh file {path} does not exist")
-    if path.suffix.lower() not in SUFFIXES:
-        raise UserError(f"{where}: mesh file {path} is of no kind that is read: expected {', '.join(SUFFIXES)}")
+    if path.suffix.lower() not in PLAIN:
+        raise UserError(f"{where}: mesh file {path} is of no kind that is read: expected {', '.join(PLAIN)}")
     try:
         parts = read_parts(Source(path, path.parent, MAX_MESH_BYTES, MAX_MESH_FACES))
     except Reject as reject:

@@ -56,13 +56,13 @@ def look(primitive: Primitive, triangles: np.ndarray, materials: list[tuple[Mate
     try:
         with at(primitive.place):
             if primitive.has("COLOR_0"):
-                look.tint = _vertex_colours(primitive, source)[triangles]
+                look.tint = vertex_colours(primitive, source)[triangles]
     except Reject as reject:
         source.note(reject.detail)
     return look
 
 
-def _vertex_colours(primitive: Primitive, source: Source) -> np.ndarray:
+def vertex_colours(primitive: Primitive, source: Source) -> np.ndarray:
     """(V, 3) linear colours."""
     values = primitive.attribute("COLOR_0", 3, 4)[:, :3]
     if values.dtype.kind == "i":  # an exporter that forgot to say so
@@ -82,22 +82,22 @@ def _material(gltf: Gltf, entry: dict[str, Any], place: str, source: Source) -> 
         return Material(colour, stated=True), 0
     try:
         with at(place):
-            return _textured(gltf, table(base, f"{name}Texture"), colour, source)
+            return textured(gltf, table(base, f"{name}Texture"), colour, source)
     except Reject as reject:
         source.note(reject.detail)
         return Material(colour), 0
 
 
-def _textured(gltf: Gltf, texture: dict[str, Any], colour: tuple, source: Source) -> tuple[Material, int]:
+def textured(gltf: Gltf, texture: dict[str, Any], colour: tuple, source: Source) -> tuple[Material, int]:
     """The material of a plain colour times an image."""
     number = integer(texture, "index")
-    entry = _one_of(gltf, "textures", number)
+    entry = one_of(gltf, "textures", number)
     webp = optional(optional(entry, "extensions"), "EXT_texture_webp")
     if "source" not in {**entry, **webp}:
         raise Reject("unsupported", f"texture {number}: no image in a format that is read")
     image = integer({**entry, **webp}, "source")
     pixels = source.images.get(image, lambda: _image_bytes(gltf, image, source))
-    sampler = _one_of(gltf, "samplers", integer(entry, "sampler")) if "sampler" in entry else {}
+    sampler = one_of(gltf, "samplers", integer(entry, "sampler")) if "sampler" in entry else {}
     wrap = tuple(WRAPS.get(sampler.get(name, 10497), "repeat") for name in ("wrapS", "wrapT"))
     moved = optional(optional(texture, "extensions"), "KHR_texture_transform")
     (angle,) = floats({"rotation": [moved.get("rotation", 0)]}, "rotation", 1)
@@ -108,7 +108,7 @@ def _textured(gltf: Gltf, texture: dict[str, Any], colour: tuple, source: Source
 
 
 def _image_bytes(gltf: Gltf, number: int, source: Source) -> bytes:
-    image = _one_of(gltf, "images", number)
+    image = one_of(gltf, "images", number)
     if "bufferView" in image:
         return bytes(gltf.view(image["bufferView"]))
     uri = image.get("uri")
@@ -119,7 +119,8 @@ def _image_bytes(gltf: Gltf, number: int, source: Source) -> bytes:
     return side_bytes(uri, source.folder, source.root, IMAGE_FORMATS, source.max_bytes)
 
 
-def _one_of(gltf: Gltf, kind: str, number: int) -> dict[str, Any]:
+def one_of(gltf: Gltf, kind: str, number: int) -> dict[str, Any]:
+    """The table of that number in a list of the tree whose entries are not checked when a file is opened."""
     entries = items(gltf.tree, kind)
     if number >= len(entries):
         raise Reject("unreadable", f"{kind[:-1]} {number} does not exist, the file has {len(entries)}")

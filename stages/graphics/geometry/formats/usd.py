@@ -16,6 +16,8 @@ import numpy as np
 
 from pipeline.errors import Reject
 from stages.graphics.geometry import colours
+from stages.graphics.geometry.colours import as_colour
+from stages.graphics.geometry.formats.parts import Part, Source, checked_part
 from stages.graphics.geometry.paths import check_path, inside
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -41,6 +43,24 @@ class UsdPart:
     material: str = ""
     inputs: dict[str, Any] = field(default_factory=dict)
     textures: dict[str, tuple[np.ndarray, tuple[str, str], np.ndarray]] = field(default_factory=dict)
+
+
+def read(data: bytes, source: Source) -> list[Part]:
+    """The triangles of a stage, turned so that y is up, as it is in the other formats."""
+    stage = open_stage(source.path, source.root)
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) if z_up(stage) else np.eye(3)
+    found = []
+    for part in parts(stage, source.root, source.max_bytes, source.max_faces, source.images):
+        vertex, face = f"{part.name}: point {{}}".format, f"{part.name}: triangle {{}}".format
+        out = checked_part(part.points @ turn.T, part.triangles, vertex, face)
+        if source.images is not None:
+            image, wrap, transform = part.textures.get("colour", (None, ("repeat", "repeat"), np.eye(3)[:2]))
+            stated = part.inputs.get("diffuseColor")
+            colour = (1.0, 1.0, 1.0) if stated is None else as_colour(np.array(stated), part.name, source.note)
+            material = colours.Material(tuple(map(float, colour)), image, wrap, transform, stated is not None)
+            out.look = colours.Look(material, part.uv, None if part.material else part.tint)
+        found.append(out)
+    return found
 
 
 def open_stage(path: Path, root: Path) -> Any:
@@ -224,14 +244,12 @@ def _texture(prim: Any, root: Path, max_bytes: int, images: colours.Images) -> A
         packaged = Ar.IsPackageRelativePath(resolved)
         outer = Path(Ar.SplitPackageRelativePathOuter(resolved)[0] if packaged else resolved)
         if not resolved or not inside(outer, root):
-            raise ValueError("outside the folder of the file, or missing")
+            raise Reject("unreadable", "it is missing, or outside the folder of the file")
         if packaged:
-            data = bytes(Ar.GetResolver().OpenAsset(Ar.ResolvedPath(resolved)).GetBuffer())
-        else:
-            if outer.suffix.lower() not in colours.IMAGE_FORMATS or outer.stat().st_size > max_bytes:
-                raise ValueError("no image that is read, or too large")
-            data = outer.read_bytes()
-        return data
+            return bytes(Ar.GetResolver().OpenAsset(Ar.ResolvedPath(resolved)).GetBuffer())
+        if outer.suffix.lower() not in colours.IMAGE_FORMATS or outer.stat().st_size > max_bytes:
+            raise Reject("unsupported", "no image that is read, or too large")
+        return outer.read_bytes()
 
     image = images.get(str(asset.path), read)
     stated = [shader.GetInput(name) for name in ("wrapS", "wrapT")]
