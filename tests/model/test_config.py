@@ -122,7 +122,7 @@ def test_strict_loading_names_what_is_wrong(tmp_path):
         checkpoint.load(folder)
     folder, _, state = broken("wrong shape")
     save_file(state | {"tri_token": torch.zeros(1, 1, 64)}, folder / "model.safetensors")
-    with pytest.raises(ValueError, match=r"tri_token \(1, 1, 64\), not \(1, 1, 128\)"):
+    with pytest.raises(ValueError, match=r"tri_token has shape \(1, 1, 64\), not \(1, 1, 128\)"):
         checkpoint.load(folder)
     with pytest.raises(ValueError, match="config.json is missing"):
         checkpoint.load(tmp_path / "nowhere")
