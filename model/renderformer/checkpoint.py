@@ -63,7 +63,9 @@ def _check_shapes(config: ModelConfig, stored: Mapping[str, tuple[int, ...]], pa
     differing = [f"{kind} parameter {_some(names)}" for kind, names in (("missing", missing), ("unknown", unknown)) if names]
     if differing:
         raise InputError(f"{path} is not of the network that {CONFIG} describes: {'; '.join(differing)}")
-    wrong = [f"{name} has shape {shape}, not {expected[name]}" for name, shape in sorted(stored.items()) if shape != expected[name]]
+    wrong = [
+        f"{name} has shape {shape}, not {expected[name]}" for name, shape in sorted(stored.items()) if shape != expected[name]
+    ]
     if wrong:
         raise InputError(f"{path}: {CONFIG} asks for other shapes: {_some(wrong)}")
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -47,8 +46,6 @@ def trace(
         raise UserError(f"view={view} does not exist: {scene_path} has {count} camera(s), counted from 0; or give 'all'")
     print_notes(scene)
     chosen = choose(backend)
-    for note in scene.meta.get("notes", ()):
-        print(f"note: {note}", file=sys.stderr)
     paths = []
     for index in range(count) if view == "all" else [view]:
         given = settings.resolution
