@@ -33,7 +33,7 @@ stages.renderformer.inference
 stages.renderformer.importing
 stages.renderformer.rendering
 stages.renderformer.dataset  stages.renderformer.scenes  stages.renderformer.objects
-stages.renderformer.views
+stages.renderformer.views  stages.renderformer.hub
 stages.renderformer.records
 stages.neuras.commands
 stages.neuras.s02_atlas  stages.neuras.s03_fit  stages.neuras.s04_bake  stages.neuras.s05_evaluate

@@ -153,6 +153,21 @@ def import_file(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def command_publish(arguments: argparse.Namespace) -> int:
+    from stages.renderformer.hub import publication, publish
+
+    what = publication(arguments.artifact, arguments.name, arguments.store, arguments.license)
+    files = list(what.listing())
+    for path, size in files:
+        print(f"{size:>14,}  {path}")
+    print(f"{sum(size for _, size in files):>14,}  bytes in {len(files):,} files, for the {what.kind} {what.name}")
+    if arguments.dry_run:
+        print("\n" + what.files["README.md"].decode().split("\n---\n")[0] + "\n---\nnothing was uploaded (--dry-run)")
+    else:
+        print(publish(what, arguments.private))
+    return 0
+
+
 def command_report(arguments: argparse.Namespace) -> int:
     from pipeline.store import Store
     from stages.renderformer.evaluation.side_by_side import write_report
@@ -259,7 +274,8 @@ def add_commands(parsers: Any, program: str) -> None:
     def add_model_options(sub: argparse.ArgumentParser) -> None:
         sub.add_argument(
             "--checkpoint",
-            help="released-format folder, or a train artifact's key, name or 'train' (default: the model that ships)",
+            help="released-format folder, hub:OWNER/NAME, or a train artifact's key, name or 'train' (default: the model that "
+            "ships)",
         )
         sub.add_argument("--composite-lights", action="store_true", help="one pass per light, summed: for many lights")
         sub.add_argument("--device", default="auto", help="cpu, cuda or auto (default)")
@@ -317,6 +333,19 @@ def add_commands(parsers: Any, program: str) -> None:
     group.add_argument("--spp", type=int, default=256, help="samples per pixel of the reference (default: 256)")
     add_model_options(sub)
     add_mesh_options(sub, "as the checkpoint was trained")
+
+    sub = add(
+        "publish", command_publish, "upload a dataset or a checkpoint to Hugging Face's hub (by the package huggingface_hub)",
+        "shard hub:OWNER/NAME --dry-run",
+    )  # fmt: skip
+    sub.add_argument(
+        "artifact", help="key or name of an artifact of shard or train, 'shard', 'train', or a checkpoint's folder"
+    )
+    sub.add_argument("name", metavar="hub:OWNER/NAME", help="the repository; it is made where it does not exist")
+    sub.add_argument("--dry-run", action="store_true", help="list the files and the card's header, and upload nothing")
+    sub.add_argument("--private", action="store_true", help="a new repository is seen by its owner alone")
+    sub.add_argument("--license", metavar="ID", help="the hub's identifier (default: a dataset's that of its objects, if one)")
+    sub.add_argument("--store", default="store", help="the store's folder (default: store)")
 
     sub = add(
         "report", command_report, "runs side by side, and probes, on one HTML page (with JSON and Markdown beside it)",

@@ -26,6 +26,7 @@ from pipeline.config import Section, StageConfig, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, RunStage
 from stages.graphics.device import choose_device
+from stages.renderformer import hub
 from stages.renderformer.dataset import BatchConfig
 
 if TYPE_CHECKING:
@@ -209,7 +210,7 @@ def name_damaged(
 
 def initial_folder(reference: str) -> Path:
     """The checkpoint folder that ``train.init_from`` names: itself, or inside a train artifact's folder."""
-    folder = Path(reference).expanduser()
+    folder = hub.checkpoint(reference) if hub.is_hub(reference) else Path(reference).expanduser()
     for candidate in (folder, folder / "files" / "checkpoint"):
         if (candidate / "config.json").is_file() and (candidate / "model.safetensors").is_file():
             return candidate

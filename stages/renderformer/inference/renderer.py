@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import UserError
+from stages.renderformer.hub import checkpoint as hub_checkpoint
+from stages.renderformer.hub import is_hub
 from stages.renderformer.inference.predict import light_passes, predict_frames
 from stages.renderformer.inference.room import LEAST_TRIANGLES, Room
 from stages.renderformer.inference.settings import PredictSettings
@@ -49,10 +51,13 @@ def shipped_checkpoint() -> Path:
 def checkpoint_folder(reference: Path | str | None, store: Path | str = "store") -> Path:
     """The released-format folder of a checkpoint.
 
-    ``reference``: such a folder, or a train artifact in the store. None: the model that ships. UserError: it is neither.
+    ``reference``: such a folder, ``hub:OWNER/NAME``, or a train artifact in the store. None: the model that ships. UserError:
+    it is neither.
     """
     if reference is None:
         return shipped_checkpoint()
+    if is_hub(reference):
+        return hub_checkpoint(str(reference))
     folder = Path(reference)
     if (folder / "config.json").is_file():
         return folder
@@ -78,8 +83,8 @@ def checkpoint_folder(reference: Path | str | None, store: Path | str = "store")
 class Renderer:
     """A trained network that renders scenes.
 
-    checkpoint: a released-format folder, or a train artifact (``"train"``: the newest in ``store``). None: the model that
-        ships. device: cpu, cuda or auto.
+    checkpoint: a released-format folder, ``hub:OWNER/NAME``, or a train artifact (``"train"``: the newest in ``store``). None:
+        the model that ships. device: cpu, cuda or auto.
     triangles, resolution: most triangles of a scene, and pixels per side, that the checkpoint was trained with.
     """
 
