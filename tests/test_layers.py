@@ -56,8 +56,9 @@ stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages
 stages.graphics
 model.renderformer  model.neuras
 model.training
+model.fetching
 model.lpips  model.inception  model.timing
-model.weights
+model.weights  model.pickles
 model.file_kinds
 model.errors
 model

@@ -44,6 +44,10 @@ class TrainOrGiven(Train):
     def slug(self, config: Any) -> str:
         return "given" if isinstance(config, GivenConfig) else super().slug(config)
 
+    def agree(self, config: Any, configs: Mapping[str, StageConfig]) -> None:
+        if not isinstance(config, GivenConfig):
+            super().agree(config, configs)
+
     def identity(self, config: Any, hash_file: Callable[[Any], str]) -> dict[str, Any]:
         if not isinstance(config, GivenConfig):
             return super().identity(config, hash_file)

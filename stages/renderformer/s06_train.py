@@ -105,6 +105,13 @@ class Train(RunStage):
     def slug(self, config: TrainConfig) -> str:
         return config.model.name
 
+    def agree(self, config: TrainConfig, configs: Mapping[str, StageConfig]) -> None:
+        """Weights that are missing are missed before anything runs."""
+        if config.lpips > 0:
+            from model.lpips import LPIPS
+
+            LPIPS.files(config.lpips_folder)
+
     def identity(self, config: TrainConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
         if config.init_from is None:
             return {}

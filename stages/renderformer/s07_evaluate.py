@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -64,6 +64,13 @@ class Evaluate(MapStage):
     version = VERSION
     inputs = ("shard", "train")
     Config = EvaluateConfig
+
+    def agree(self, config: EvaluateConfig, configs: Mapping[str, StageConfig]) -> None:
+        """Weights that are missing are missed before anything runs."""
+        if config.lpips != "none":
+            from model.lpips import LPIPS
+
+            LPIPS.files(config.lpips_folder, config.lpips)
 
     def slug(self, config: EvaluateConfig) -> str:
         return config.split
