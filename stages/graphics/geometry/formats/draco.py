@@ -27,7 +27,7 @@ def decode(data: bytes, stated_faces: int) -> tuple[np.ndarray, dict[int, np.nda
     require_decoder()
     import DracoPy
 
-    with at("its Draco data"):
+    with at("Draco data"):
         faces = claimed_faces(data[:64])
         if faces > stated_faces:
             raise Reject("unreadable", f"{faces} faces where {stated_faces} are stated")

@@ -196,7 +196,9 @@ class Gltf:
         number = integer(entry, "bufferView")
         if number not in self._decoded:
             stated = layout(self.entry("accessors", integer(primitive, "indices")))[0] // 3
-            self._decoded[number] = draco.decode(bytes(self.view(number)), stated)
+            data = bytes(self.view(number))
+            with at(f"buffer view {number}"):
+                self._decoded[number] = draco.decode(data, stated)
         triangles, values = self._decoded[number]
         names = table(entry, "attributes")
         return triangles, {name: values[id] for name, id in names.items() if isinstance(id, int) and id in values}
