@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from pipeline.config import StageConfig, runtime
+from pipeline.config import StageConfig, added, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.graphics.arrays import pack_json
@@ -52,6 +52,7 @@ class PandasetConfig(FolderConfig):
 
     name: Literal["pandaset"] = "pandaset"
     cameras: list[str] = Field(["front_camera"], min_length=1)  # folders below camera/
+    mask_actors: bool = added(True, legacy=False)  # what moves does not count, and its points go
 
 
 class Capture(MapStage):

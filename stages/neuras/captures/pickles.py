@@ -1,4 +1,4 @@
-"""Tables of numbers in strangers' pandas pickles, without running anything that the pickle asks for.
+"""Tables of numbers and words in strangers' pandas pickles, without running anything that the pickle asks for.
 
 Every name that such a pickle may use becomes an inert ``_Stub``; any other name is refused. What the stubs hold is then
 read as a table: neither pandas nor numpy's own unpickling takes part.
@@ -54,12 +54,15 @@ class _Stub:
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in KNOWN:
-            raise Reject("unreadable", f"the pickle asks for {module}.{name}: only plain tables of numbers are read")
+            raise Reject("unreadable", f"the pickle asks for {module}.{name}: only plain tables are read")
         return type(name, (_Stub,), {"name": name})
 
 
 def table(path: Path) -> dict[str, np.ndarray]:
-    """The columns of numbers, by name, of a pickled data frame (``.pkl`` or ``.pkl.gz``); raises Reject."""
+    """The columns, by name, of a pickled data frame (``.pkl`` or ``.pkl.gz``); raises Reject.
+
+    Columns of words are arrays of objects: strings, and None for anything else.
+    """
     if path.stat().st_size > MAX_FILE:
         raise Reject("too_large", f"{path.name} has {path.stat().st_size} bytes, at most {MAX_FILE} are read")
     try:
@@ -89,9 +92,9 @@ def _columns(frame: Any) -> dict[str, np.ndarray]:
     names = _index(axes[0])
     columns = {}
     for values, places in parts:
-        if not _is_numbers(values):
+        if not (_is_numbers(values) or _is_objects(values)):
             continue
-        rows, numbers = _array(values), _places(places)
+        rows, numbers = _array(values) if _is_numbers(values) else _words(values), _places(places)
         if rows.ndim != 2 or len(rows) != len(numbers):
             raise ValueError(f"a block of shape {rows.shape} for {len(numbers)} columns")
         columns |= {str(names[number]): row for number, row in zip(numbers, rows, strict=True)}
@@ -118,6 +121,18 @@ def _is_numbers(stub: Any) -> bool:
     return isinstance(stub, _Stub) and (
         stub.name == "_frombuffer" or (stub.name == "_reconstruct" and isinstance(stub.state[-1], (bytes, bytearray, _Stub)))
     )
+
+
+def _is_objects(stub: Any) -> bool:
+    return isinstance(stub, _Stub) and stub.name == "_reconstruct" and isinstance(stub.state[-1], list)
+
+
+def _words(stub: _Stub) -> np.ndarray:
+    """Of an array of objects, the strings."""
+    shape, _, fortran, values = stub.state[-4:]
+    words = np.empty(len(values), object)
+    words[:] = [value if isinstance(value, str) else None for value in values]
+    return words.reshape(shape, order="F" if fortran else "C")
 
 
 def _array(stub: _Stub) -> np.ndarray:

@@ -17,7 +17,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from pydantic import Field
 
-from pipeline.config import StageConfig, count, existing_folder, report, runtime
+from pipeline.config import StageConfig, added, count, existing_folder, report, runtime
 from pipeline.errors import Reject, UserError
 from pipeline.keys import digest_of
 from stages.graphics.geometry.paths import check_path
@@ -57,8 +57,9 @@ class FolderConfig(StageConfig):
     path: str | None = runtime(None)  # capture.path=DIR; the content of its files is what counts
     mesh: str | None = runtime(None)  # a mesh to learn on; null: mesh.ply, mesh.glb or mesh.obj in the folder, if there is one
     every: int = count(1, ge=1)  # keep every so-many-th frame, of each split by itself where the set names them
-    split: splits.Rule = "auto"  # auto: the names that the set gives, else every_other
+    split: splits.RuleName = "auto"  # auto: the names that the set gives, else every_other
     seed: int = 0  # of random_half
+    nth: int = added(8, legacy=8, ge=3)  # of every_nth: one frame in so many is for training
     max_side: int | None = Field(None, ge=16)  # longest side of a picture in pixels, larger ones are made smaller
     units: Literal["auto", "metre", "arbitrary"] = report("auto")  # auto: what the set says, else arbitrary
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = report("auto")  # auto: what the set says, else from the cameras
@@ -69,12 +70,17 @@ class FolderConfig(StageConfig):
 
 @dataclass
 class Shot:
-    """A posed image as a set on disk states it. moment: what frames taken at one time share. split: as the set names it."""
+    """A posed image as a set on disk states it. moment: what frames taken at one time share. split: as the set names it.
+
+    mask, outlines, backdrop: see ``pictures.Original``.
+    """
 
     name: str  # of the image, relative to the capture's folder, for people
     moment: Hashable = None
     image: Path | None = None
     mask: Path | None = None
+    outlines: list[list[list[float]]] = field(default_factory=list)
+    backdrop: tuple[int, int, int] | None = None
     lens: Lens | None = None
     camera_to_world: np.ndarray | None = None
     split: Split | None = None
@@ -87,13 +93,15 @@ class Shot:
 class PointSet:
     """Points in a file, read when they are asked for. read: (P, 3) float32 and the sensor's position (3,) or None.
 
-    moment: of the frames that were taken with it; None for what belongs to no one time.
+    moment: of the frames that were taken with it; None for what belongs to no one time. facts: what decides the points
+    besides the file.
     """
 
     name: str
     file: Path
     read: Callable[[], tuple[np.ndarray, np.ndarray | None]]
     moment: Hashable = None
+    facts: Any = None
 
 
 @dataclass
@@ -140,7 +148,9 @@ class FolderSource:
         self.shots = dict(zip(_ids([shots[index].name for index in kept]), (shots[index] for index in kept), strict=True))
         chosen = list(self.shots.values())
         assigned, self.split_rule = splits.assigned(
-            [shot.moment for shot in chosen], [shot.split for shot in chosen], config.split, config.seed
+            [shot.moment for shot in chosen],
+            [shot.split for shot in chosen],
+            splits.Rule(config.split, config.seed, config.nth),
         )
         self.splits = dict(zip(self.shots, assigned, strict=True))
         if config.every > 1:
@@ -157,7 +167,8 @@ class FolderSource:
         shot = self.shots[id]
         if shot.fault is not None:
             raise shot.fault
-        picture = pictures.made(shot.image, shot.mask, shot.lens, self.config.max_side, self.config.max_pixels)
+        original = pictures.Original(shot.image, shot.lens, shot.mask, shot.outlines, shot.backdrop)
+        picture = pictures.made(original, self.config.max_side, self.config.max_pixels)
         camera = shot.lens.camera(shot.camera_to_world).resized(*picture.size)
         return FrameRecord(
             id, camera, picture.image, self.splits[id], time=shot.time, mask=picture.mask, meta={"file": shot.name, **shot.meta}
@@ -216,9 +227,11 @@ class FolderSource:
                 "said": [self.splits[id], shot.time, shot.name, shot.meta],
                 "fault": shot.fault and [shot.fault.reason, shot.fault.detail],
             }
-            items[id] = digest_of(facts)
+            rarer = {"outlines": shot.outlines, "backdrop": _plain(shot.backdrop)}  # left out of the key where there are none
+            items[id] = digest_of(facts | {name: value for name, value in rarer.items() if value})
         for id, it in self.sets.items():
-            items[id] = hash_file(it.file)
+            content = hash_file(it.file)
+            items[id] = content if it.facts is None else digest_of([content, it.facts])
         mesh = None if self.mesh_file is None else hash_file(self.mesh_file)
         told = {"units": self.inventory.units, "up": _plain(self.inventory.up), "points": self.inventory.points}
         return {"items": items, "mesh": mesh, "told": told}
