@@ -19,6 +19,7 @@ from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.graphics.arrays import pack_json
 from stages.neuras.captures.sources import FolderConfig, FolderSource, Source
+from stages.neuras.captures.splits import RuleName
 from stages.neuras.records import POINTS, FrameRecord, frames, point_sets, save
 from stages.neuras.street.settings import StreetConfig
 
@@ -55,12 +56,26 @@ class PandasetConfig(FolderConfig):
     mask_actors: bool = added(True, legacy=False)  # what moves does not count, and its points go
 
 
+class BlendedMVSConfig(FolderConfig):
+    """A scene of BlendedMVS in its own layout, or one of MVSNet's."""
+
+    name: Literal["blendedmvs"] = "blendedmvs"
+    split: RuleName = "random_half"  # as the paper's table 2
+
+
+class NerfSyntheticConfig(FolderConfig):
+    """An object of NeRF's synthetic set in its own layout."""
+
+    name: Literal["nerf_synthetic"] = "nerf_synthetic"
+
+
+FOLDERS = NerfstudioConfig | ColmapConfig | PandasetConfig | BlendedMVSConfig | NerfSyntheticConfig
+
+
 class Capture(MapStage):
     name: ClassVar[str] = "capture"
     version: ClassVar[int] = 2
-    Config: ClassVar[Any] = Annotated[
-        StreetCaptureConfig | NerfstudioConfig | ColmapConfig | PandasetConfig, Field(discriminator="name")
-    ]
+    Config: ClassVar[Any] = Annotated[StreetCaptureConfig | FOLDERS, Field(discriminator="name")]
     reasons: ClassVar[dict[str, str]] = {
         "no_pose": "the frame has no camera pose, or one of another shape",
         "left_handed": "the axes of its pose are mirrored",
@@ -154,11 +169,17 @@ class Capture(MapStage):
 
 
 def _source(config: StageConfig) -> Source:
-    from stages.neuras.captures import colmap, nerfstudio, pandaset
+    from stages.neuras.captures import blendedmvs, colmap, nerf_synthetic, nerfstudio, pandaset
     from stages.neuras.street.source import StreetSource
 
     if isinstance(config, StreetCaptureConfig):
         return StreetSource(config)
 
-    readers = {"nerfstudio": nerfstudio.read, "colmap": colmap.read, "pandaset": pandaset.read}
+    readers = {
+        "nerfstudio": nerfstudio.read,
+        "colmap": colmap.read,
+        "pandaset": pandaset.read,
+        "blendedmvs": blendedmvs.read,
+        "nerf_synthetic": nerf_synthetic.read,
+    }
     return FolderSource(config, readers[config.name])

@@ -205,6 +205,43 @@ def cuboids(root: Path, write=old_frame, things=lambda number: THINGS, count: in
     return root
 
 
+def blendedmvs(root: Path, count: int = 6) -> Path:
+    (root / "cams").mkdir(parents=True)
+    (root / "cams" / "pair.txt").write_text("1\n0\n1 1 5.0\n")
+    for number in range(count):
+        picture(number, root / "blended_images" / f"{number:08d}.jpg")
+        Image.new("RGB", (WIDTH, HEIGHT)).save(root / "blended_images" / f"{number:08d}_masked.jpg")
+        rotation, translation = view(number)
+        rows = [*np.column_stack([rotation, translation]).tolist(), [0, 0, 0, 1]]
+        intrinsic = [[FX, 0, CX], [0, FY, CY], [0, 0, 1]]
+        text = ["extrinsic", *(" ".join(map(str, row)) for row in rows), "", "intrinsic"]
+        text += [*(" ".join(map(str, row)) for row in intrinsic), "", "1.5 0.02 128 4.0", ""]
+        (root / "cams" / f"{number:08d}_cam.txt").write_text("\n".join(text))
+    return root
+
+
+def nerf_synthetic(root: Path, count: int = 3, size: int = 120) -> Path:
+    """White dots over clear pixels, which are black where the alpha channel is dropped."""
+    angle = 2 * np.arctan(0.5 * size / FX)
+    for split in ("train", "val", "test"):
+        entries = []
+        for number in range(count):
+            rotation, translation = view(number)
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = rotation.T, -rotation.T @ translation
+            x, y, z = rotation @ POINT + translation
+            centre = np.array([x / z, y / z]) * FX + size / 2
+            pixels = np.stack(np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5), axis=-1)
+            alpha = 255 * np.exp(-((pixels - centre) ** 2).sum(axis=-1) / 4)
+            name = f"{split}/r_{number}"
+            (root / split).mkdir(parents=True, exist_ok=True)
+            Image.fromarray(np.dstack([np.zeros((size, size, 3)), alpha]).astype(np.uint8)).save(root / f"{name}.png")
+            matrix = (matrix @ np.diag([1, -1, -1, 1])).tolist()
+            entries.append({"file_path": f"./{name}", "rotation": 0.01, "transform_matrix": matrix})
+        (root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": entries}))
+    return root
+
+
 def source_of(root: Path, name: str = "nerfstudio", **settings):
     stage = Capture()
     config = parse(stage.Config, {"name": name, "path": str(root), **settings}, "capture")
@@ -408,6 +445,63 @@ def test_the_ball_holds_what_cameras_see():
     assert poses.ball([camera], far)[1] < 3
     assert poses.ball([camera], np.zeros((0, 3)))[1] == 1.0
     assert poses.in_view([camera], np.concatenate([seen, stray])).sum() == len(seen)
+
+
+# --- the paper's other sets -------------------------------------------------------------------------------------------
+
+
+def test_blendedmvs_puts_the_point_at_its_pixel_and_its_tiles_together(tmp_path):
+    import trimesh
+
+    root = blendedmvs(tmp_path / "set")
+    for number in range(2):
+        tile = root / "textured_mesh" / f"tile_{number}" / "model.obj"
+        tile.parent.mkdir(parents=True)
+        trimesh.creation.box(bounds=[[number, 0, 0], [number + 1, 1, 1]]).export(tile)
+    source = source_of(root, "blendedmvs")
+    assert_dots(source)
+    groups = [group for _, group in source.items()]
+    assert "random half" in source.info().split_rule and groups.count("test") == 3 and source.info().units == "arbitrary"
+    mesh = source.mesh()
+    assert mesh.faces.shape == (24, 3) and mesh.vertices[:, 0].max() == 2 and mesh.faces.max() == 15
+    given = source_of(root, "blendedmvs", mesh=str(root / "textured_mesh" / "tile_1")).mesh()
+    assert given.faces.shape == (12, 3) and given.vertices[:, 0].min() == 1
+
+
+def test_blendedmvs_says_what_is_wrong(tmp_path):
+    with pytest.raises(UserError, match="no cams/NNNNNNNN_cam.txt"):
+        source_of(tmp_path, "blendedmvs")
+    root = blendedmvs(tmp_path / "set")
+    camera = root / "cams" / "00000002_cam.txt"
+    camera.write_text(camera.read_text().replace("intrinsic", "nothing"))
+    Image.new("RGB", (40, 30)).save(root / "blended_images" / "00000003.jpg")  # of another resolution
+    (root / "blended_images" / "00000004.jpg").unlink()
+    shots = source_of(root, "blendedmvs").shots
+    reasons = {id: shot.fault.reason for id, shot in shots.items() if shot.fault}
+    assert list(reasons.values()) == ["no_pose", "no_intrinsics", "no_image"]
+    with pytest.raises(UserError, match="neither a mesh nor a folder"):
+        source_of(root, "blendedmvs", mesh=str(root / "cams"))
+
+
+def test_nerf_synthetic_is_shown_over_white_in_its_splits(tmp_path):
+    source = source_of(nerf_synthetic(tmp_path), "nerf_synthetic")
+    assert [group for _, group in source.items()] == ["train"] * 3 + ["validation"] * 3 + ["test"] * 3
+    assert source.info().up == (0, 0, 1) and source.mesh() is None
+    for frame in frames_of(source):
+        image = frame.image()
+        darkest = np.array(np.unravel_index(image[..., 0].argmin(), image.shape[:2]))[::-1] + 0.5
+        assert np.abs(darkest - frame.camera.project(POINT)[0]).max() < 1 and frame.mask is None
+        assert image.min() < 60 and np.median(image) == 255
+
+
+def test_nerf_synthetic_says_what_is_wrong(tmp_path):
+    with pytest.raises(UserError, match="no transforms_train.json"):
+        source_of(tmp_path, "nerf_synthetic")
+    root = nerf_synthetic(tmp_path)
+    path = root / "transforms_train.json"
+    path.write_text(path.read_text().replace("camera_angle_x", "angle"))
+    with pytest.raises(UserError, match="3 no_intrinsics.*camera_angle_x"):
+        source_of(root, "nerf_synthetic")
 
 
 # --- faults -----------------------------------------------------------------------------------------------------------
@@ -782,6 +876,7 @@ def test_every_variants_settings_exist_and_are_the_defaults_but_for_what_it_says
     assert config.name == path.stem
     other = {name for name, value in config if value != type(config).model_fields[name].get_default(call_default_factory=True)}
     assert other == ({"max_side"} if path.stem == "pandaset" else set())
+    assert config.split == "random_half" if path.stem == "blendedmvs" else folder is False or config.split == "auto"
 
 
 def test_every_reason_is_told_to_users():

@@ -10,7 +10,6 @@ LiDAR comes up to 0.1 s later; things in its view have a box of their own for it
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from stages.neuras.captures import pickles, poses
 from stages.neuras.captures.actors import Box, inside, outline
 from stages.neuras.captures.lenses import Lens
 from stages.neuras.captures.pictures import size_of
-from stages.neuras.captures.sources import Inventory, PointSet, Shot, file_in, shot_of
+from stages.neuras.captures.sources import Inventory, PointSet, Shot, file_in, json_in, shot_of
 
 COLUMNS = ("position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z", "yaw")
 MOTION = "attributes.object_motion"
@@ -46,8 +45,8 @@ def _shots(root: Path, camera: str, boxes: Boxes) -> list[Shot]:
     if "/" in camera or camera.startswith(".") or not folder.is_dir():
         known = sorted(path.name for path in (root / "camera").glob("*") if path.is_dir())
         raise UserError(f"capture.cameras: {str(root)!r} has no camera {camera!r}; it has {', '.join(known) or 'none'}")
-    placed, intrinsics = _json(root, folder / "poses.json", list), _json(root, folder / "intrinsics.json", dict)
-    times = _json(root, folder / "timestamps.json", list)
+    placed, intrinsics = json_in(root, folder / "poses.json", list), json_in(root, folder / "intrinsics.json", dict)
+    times = json_in(root, folder / "timestamps.json", list)
     if len(times) != len(placed) or not all(isinstance(time, (int, float)) for time in times):
         raise UserError(f"{folder}: timestamps.json must hold one number for each of the {len(placed)} poses")
     shots = []
@@ -73,7 +72,7 @@ def _sweeps(root: Path, boxes: Boxes) -> list[PointSet]:
     folder = root / "lidar"
     if not (folder / "poses.json").is_file():
         return []
-    sensors = _json(root, folder / "poses.json", list)
+    sensors = json_in(root, folder / "poses.json", list)
     sets = []
     for index, pose in enumerate(sensors):
         path = folder / f"{index:02d}.pkl.gz"
@@ -149,17 +148,3 @@ def _lens(told: dict[str, Any], width: int, height: int) -> Lens:
     if lens.wrong():
         raise Reject("no_intrinsics", f"{lens.wrong()}: the images may have been made smaller than the set's 1920 x 1080")
     return lens
-
-
-def _json(root: Path, path: Path, kind: type) -> Any:
-    if not paths.inside(path, root):
-        raise UserError(f"{str(path)!r} leads out of {str(root)!r}")
-    try:
-        value = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        raise UserError(f"there is no {str(path)!r}: capture=pandaset reads a sequence in PandaSet's own layout") from None
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{str(path)!r} is not JSON: {error}") from None
-    if not isinstance(value, kind):
-        raise UserError(f"{str(path)!r} does not hold a {kind.__name__}")
-    return value

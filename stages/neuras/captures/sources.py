@@ -7,6 +7,7 @@ what is wrong with the whole set is a UserError at once.
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
@@ -20,7 +21,8 @@ from pydantic import Field
 from pipeline.config import StageConfig, added, count, existing_folder, report, runtime
 from pipeline.errors import Reject, UserError
 from pipeline.keys import digest_of
-from stages.graphics.geometry.paths import check_path
+from stages.graphics.geometry.load import SUFFIXES, load_mesh
+from stages.graphics.geometry.paths import check_path, inside
 from stages.neuras.captures import pictures, poses, splits
 from stages.neuras.captures.lenses import Lens
 from stages.neuras.records import FRAME, POINTS, CaptureInfo, FrameRecord, Mesh, PointsRecord, Split
@@ -55,7 +57,9 @@ class FolderConfig(StageConfig):
     """What the captures in folders have in common."""
 
     path: str | None = runtime(None)  # capture.path=DIR; the content of its files is what counts
-    mesh: str | None = runtime(None)  # a mesh to learn on; null: mesh.ply, mesh.glb or mesh.obj in the folder, if there is one
+    mesh: str | None = runtime(
+        None
+    )  # a mesh to learn on, or a folder of its tiles; null: mesh.ply, mesh.glb or mesh.obj in the folder, if there is one
     every: int = count(1, ge=1)  # keep every so-many-th frame, of each split by itself where the set names them
     split: splits.RuleName = "auto"  # auto: the names that the set gives, else every_other
     seed: int = 0  # of random_half
@@ -106,7 +110,8 @@ class PointSet:
 
 @dataclass
 class Inventory:
-    """What a reader finds. units and up: None where the set does not say. units_from: where it says so, in words."""
+    """What a reader finds. units and up: None where the set does not say. units_from: where it says so, in words. mesh: the
+    files of the set's own mesh."""
 
     shots: list[Shot]
     sets: list[PointSet] = field(default_factory=list)
@@ -114,6 +119,7 @@ class Inventory:
     units: Literal["metre", "arbitrary"] | None = None
     units_from: str = "nothing in the set says it"
     up: tuple[float, float, float] | None = None
+    mesh: list[Path] = field(default_factory=list)
 
 
 def shot_of(name: str, fill: Callable[[Shot], None]) -> Shot:
@@ -134,6 +140,21 @@ def file_in(root: Path, name: Any, what: str) -> Path:
     if not path.is_file():
         raise Reject(f"no_{what}", f"there is no file {name!r}")
     return path
+
+
+def json_in(root: Path, path: Path, kind: type) -> Any:
+    """The content of a JSON file that a set must have; raises UserError."""
+    if not inside(path, root):
+        raise UserError(f"{str(path)!r} leads out of {str(root)!r}")
+    try:
+        value = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise UserError(f"there is no {str(path)!r}: the set must lie in its own layout (docs/captures.md)") from None
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{str(path)!r} is not JSON: {error}") from None
+    if not isinstance(value, kind):
+        raise UserError(f"{str(path)!r} does not hold a {kind.__name__}")
+    return value
 
 
 class FolderSource:
@@ -157,7 +178,7 @@ class FolderSource:
             self.split_rule += f"; of the set's frames one in {config.every} is taken"
         held = {shot.moment for shot, split in zip(chosen, assigned, strict=True) if split == "test"}
         self.sets = {f"{POINTS}{it.name}": it for it in self.inventory.sets if it.moment is None or it.moment not in held}
-        self.mesh_file = _mesh_file(config, self.root)
+        self.mesh_files = _mesh_files(config, self.root) or self.inventory.mesh
         self._check()
 
     def items(self) -> list[tuple[str, str]]:
@@ -183,15 +204,19 @@ class FolderSource:
 
     def mesh(self) -> Mesh | None:
         """The given mesh; UserError where it is none."""
-        from stages.graphics.geometry.load import load_mesh
-
-        if self.mesh_file is None:
+        vertices, faces = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)]
+        for path in self.mesh_files:
+            try:
+                loaded = load_mesh(path, path.parent, self.config.max_bytes, self.config.max_faces)
+            except Reject as error:
+                raise UserError(f"the mesh {str(path)!r} cannot be used: {error.detail}") from None
+            faces.append(loaded.faces + sum(map(len, vertices)))
+            vertices.append(loaded.vertices)
+        if not self.mesh_files:
             return None
-        try:
-            loaded = load_mesh(self.mesh_file, self.mesh_file.parent, self.config.max_bytes, self.config.max_faces)
-        except Reject as error:
-            raise UserError(f"the mesh {str(self.mesh_file)!r} cannot be used: {error.detail}") from None
-        return Mesh(loaded.vertices.astype(np.float32), loaded.faces.astype(np.int32))
+        if (number := sum(map(len, faces))) > self.config.max_faces:
+            raise UserError(f"the mesh has {number:,} faces, over capture.max_faces={self.config.max_faces:,}")
+        return Mesh(np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32))
 
     def info(self) -> CaptureInfo:
         config, inventory = self.config, self.inventory
@@ -232,7 +257,8 @@ class FolderSource:
         for id, it in self.sets.items():
             content = hash_file(it.file)
             items[id] = content if it.facts is None else digest_of([content, it.facts])
-        mesh = None if self.mesh_file is None else hash_file(self.mesh_file)
+        tiles = [hash_file(path) for path in self.mesh_files]
+        mesh = tiles if len(tiles) > 1 else tiles[0] if tiles else None
         told = {"units": self.inventory.units, "up": _plain(self.inventory.up), "points": self.inventory.points}
         return {"items": items, "mesh": mesh, "told": told}
 
@@ -280,11 +306,13 @@ def _ids(names: Iterable[str]) -> list[str]:
     return [FRAME + slug for slug in ids]
 
 
-def _mesh_file(config: FolderConfig, root: Path) -> Path | None:
+def _mesh_files(config: FolderConfig, root: Path) -> list[Path]:
+    """The mesh that the settings name, or that lies in the folder; a folder of tiles is one mesh."""
     if config.mesh is not None:
         path = Path(config.mesh).expanduser()
-        if not path.is_file():
-            raise UserError(f"capture.mesh={config.mesh!r} is not a file")
-        return path
+        tiles = sorted(tile for tile in path.rglob("*") if tile.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
+        if not tiles or not all(tile.is_file() for tile in tiles):
+            raise UserError(f"capture.mesh={config.mesh!r} is neither a mesh nor a folder of meshes ({', '.join(SUFFIXES)})")
+        return tiles
     beside = (root / f"mesh.{suffix}" for suffix in ("ply", "glb", "obj"))
-    return next((path for path in beside if path.is_file()), None)
+    return next(([path] for path in beside if path.is_file()), [])
