@@ -146,7 +146,7 @@ class Capture(MapStage):
         yield record.to_record()
 
     def finish(self, config: StageConfig, inputs: Inputs, draft: Draft) -> None:
-        from stages.neuras.captures import sheet
+        from stages.neuras.captures import sanity, sheet
 
         source = _source(config)
         info = source.info()
@@ -159,6 +159,9 @@ class Capture(MapStage):
         shown = [FrameRecord.from_record(draft.read(views[index].id)) for index in sheet.chosen(len(views))]
         (draft.files / "contact.png").write_bytes(sheet.drawn(views, shown, place))
         draft.note("summary", sheet.summary(views, place))
+        training = [view for view in views if view.split == "train"]
+        if training and isinstance(source, FolderSource):
+            sanity.check(training, place.surface(), lambda id: FrameRecord.from_record(draft.read(id)))
         if info.units == "arbitrary":
             nominal = f"a hundredth of the capture's radius, {info.metre:.4g}, stands for a metre"
             draft.log(f"unit unknown ({info.source['units_from']}): {nominal}. If the set is in metres: capture.units=metre")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import gzip
 import io
 import pickle
+import pickletools
 import re
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 from pipeline.errors import Reject
 
 MAX_FILE, MAX_BYTES = 256 << 20, 1 << 30  # as it lies there, and unpacked
+BLOCK = 1 << 20  # bytes unpacked at a time
 
 _MODULES = {
     "DataFrame": ("pandas", "pandas.core.frame"),
@@ -67,9 +69,12 @@ def table(path: Path) -> dict[str, np.ndarray]:
         raise Reject("too_large", f"{path.name} has {path.stat().st_size} bytes, at most {MAX_FILE} are read")
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise Reject("too_large", f"{path.name} unpacks to over {MAX_BYTES} bytes")
+            data = bytearray()
+            while block := file.read(BLOCK):
+                data += block
+                if len(data) > MAX_BYTES:
+                    raise Reject("too_large", f"{path.name} unpacks to over {MAX_BYTES} bytes")
+        _check_claims(data)
         return _columns(_Unpickler(io.BytesIO(data)).load())
     except Reject:
         raise
@@ -77,6 +82,13 @@ def table(path: Path) -> dict[str, np.ndarray]:
         raise
     except Exception as error:  # a stranger's pickle fails in every way
         raise Reject("unreadable", f"{path.name}: {type(error).__name__}: {str(error)[:150]}") from None
+
+
+def _check_claims(data: bytearray) -> None:
+    """Raises ValueError where a length or a number of the memo is more than the bytes can hold: loading would reserve it."""
+    for code, value, _ in pickletools.genops(data):  # itself takes what is there, never what is claimed
+        if "PUT" in code.name and value > len(data):
+            raise ValueError(f"it numbers {value} values in {len(data)} bytes")
 
 
 def _columns(frame: Any) -> dict[str, np.ndarray]:

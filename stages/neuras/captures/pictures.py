@@ -49,7 +49,7 @@ def made(original: Original, max_side: int | None, max_pixels: int) -> Picture:
     lens = original.lens
     image = _opened(original.image, max_pixels, "image")
     if image.size != (lens.width, lens.height):
-        raise Reject("size", f"the image has {_times(image.size)} pixels, its intrinsics are for {lens.width} x {lens.height}")
+        raise Reject("size", _other_size(image.size, lens))
     if original.backdrop is not None and image.has_transparency_data:
         image = _over(image, original.backdrop)
     mask = _mask(original, image.size, max_pixels)
@@ -91,6 +91,14 @@ def _over(image: Image.Image, backdrop: tuple[int, int, int]) -> Image.Image:
     """The image in front of one colour, mixed as the values stand, as the data sets that have such images do it."""
     ground = Image.new("RGBA", image.size, (*backdrop, 255))
     return Image.alpha_composite(ground, image.convert("RGBA")).convert("RGB")
+
+
+def _other_size(size: tuple[int, int], lens: Lens) -> str:
+    said = f"the image has {_times(size)} pixels, its intrinsics are for {lens.width} x {lens.height}"
+    across, down = size[0] / lens.width, size[1] / lens.height
+    if abs(across / down - 1) > 0.01:
+        return f"{said}: another camera's, or the image was cut or turned"
+    return f"{said}: multiply the focal lengths, the principal point and the size in the set's file by {across:.4g}"
 
 
 def size_of(path: Path) -> tuple[int, int]:

@@ -27,6 +27,7 @@ from stages.neuras.captures import pictures, poses, splits
 from stages.neuras.captures.lenses import Lens
 from stages.neuras.records import FRAME, POINTS, CaptureInfo, FrameRecord, Mesh, PointsRecord, Split
 
+FEWEST = 3  # usable frames
 SEEN = 50_000  # points that decide the capture's ball
 AXES = {sign + name: tuple((-1.0 if sign else 1.0) * (name == axis) for axis in "xyz") for name in "xyz" for sign in ("", "-")}
 
@@ -277,11 +278,18 @@ class FolderSource:
     def _check(self) -> None:
         if not self.shots:
             raise UserError(f"capture.path={str(self.root)!r} holds no frame")
-        if not any(shot.fault is None and self.splits[id] == "train" for id, shot in self.shots.items()):
-            faults = Counter(shot.fault.reason for shot in self.shots.values() if shot.fault is not None)
-            told = ", ".join(f"{number} {reason}" for reason, number in sorted(faults.items())) or "none is at fault"
-            first = next((f"; {shot.name}: {shot.fault.detail}" for shot in self.shots.values() if shot.fault is not None), "")
+        usable = [self.splits[id] for id, shot in self.shots.items() if shot.fault is None]
+        if "train" in usable and len(usable) >= FEWEST:
+            return
+        faults = Counter(shot.fault.reason for shot in self.shots.values() if shot.fault is not None)
+        told = ", ".join(f"{number} {reason}" for reason, number in sorted(faults.items())) or "none is at fault"
+        first = next((f"; {shot.name}: {shot.fault.detail}" for shot in self.shots.values() if shot.fault is not None), "")
+        if "train" not in usable:
             raise UserError(f"no training frame is usable ({len(self.shots)} frames: {told}{first})")
+        raise UserError(
+            f"{len(usable)} usable frames are too few, at least {FEWEST} are needed to learn from some and to test on others: "
+            f"take more images, or keep more of them (capture.every={self.config.every}; {told}{first})"
+        )
 
 
 def _plain(value: Any) -> Any:
