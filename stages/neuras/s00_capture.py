@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -69,7 +70,17 @@ class NerfSyntheticConfig(FolderConfig):
     name: Literal["nerf_synthetic"] = "nerf_synthetic"
 
 
-FOLDERS = NerfstudioConfig | ColmapConfig | PandasetConfig | BlendedMVSConfig | NerfSyntheticConfig
+class ImagesConfig(FolderConfig):
+    """Photos in a folder, or a video, without poses: pycolmap finds them."""
+
+    name: Literal["images"] = "images"
+    video_frames: int = Field(80, ge=3)  # a video is cut into so many, the sharpest of each stretch
+    sfm_side: int = Field(
+        1000, ge=100
+    )  # longest side of the pictures that features are looked for in; pictures stay as they are
+
+
+FOLDERS = NerfstudioConfig | ColmapConfig | PandasetConfig | BlendedMVSConfig | NerfSyntheticConfig | ImagesConfig
 
 
 class Capture(MapStage):
@@ -123,18 +134,22 @@ class Capture(MapStage):
         return [Item(id, group) for id, group in _source(config).items()]
 
     def prepare(self, config: StageConfig, inputs: Inputs, folder: Path) -> None:
-        """The made-up place, which all workers look at."""
+        """The made-up place, or the poses of images that have none: all workers look at it."""
         if isinstance(config, StreetCaptureConfig):
             from stages.neuras.street import source
 
             source.prepare(config, folder)
+        if isinstance(config, ImagesConfig):
+            from stages.neuras.captures import images
+
+            images.prepare(config, images.root_of(config.path), folder)
 
     def open(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any]) -> Source:
         return _source(config)
 
     def open_prepared(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any], folder: Path) -> Source:
         if not isinstance(config, StreetCaptureConfig):
-            return self.open(config, inputs, environment)
+            return _source(config, folder)
         from stages.graphics.mitsuba import backend
         from stages.neuras.street.source import StreetSource
 
@@ -148,7 +163,10 @@ class Capture(MapStage):
     def finish(self, config: StageConfig, inputs: Inputs, draft: Draft) -> None:
         from stages.neuras.captures import sanity, sheet
 
-        source = _source(config)
+        if isinstance(config, ImagesConfig):
+            draft.prepared.mkdir(exist_ok=True)
+            self.prepare(config, inputs, draft.prepared)  # a run that took every frame over has not done it
+        source = _source(config, draft.prepared)
         info = source.info()
         (draft.files / "capture.json").write_bytes(pack_json(info.to_json()))
         mesh = source.mesh()
@@ -171,13 +189,15 @@ class Capture(MapStage):
             raise UserError("no training frame is left: see the rejected frames' reasons above")
 
 
-def _source(config: StageConfig) -> Source:
-    from stages.neuras.captures import blendedmvs, colmap, nerf_synthetic, nerfstudio, pandaset
+def _source(config: StageConfig, prepared: Path | None = None) -> Source:
+    """The capture. prepared: the folder that ``prepare`` wrote to; without it images without poses have none."""
+    from stages.neuras.captures import blendedmvs, colmap, images, nerf_synthetic, nerfstudio, pandaset
     from stages.neuras.street.source import StreetSource
 
     if isinstance(config, StreetCaptureConfig):
         return StreetSource(config)
-
+    if isinstance(config, ImagesConfig):
+        return FolderSource(config, partial(images.read, prepared=prepared), images.root_of(config.path))
     readers = {
         "nerfstudio": nerfstudio.read,
         "colmap": colmap.read,

@@ -21,6 +21,7 @@ from stages.neuras.captures.lenses import bilinear
 from stages.neuras.records import FrameRecord
 
 POINTS = 20_000  # of the surface that are looked at
+FEWEST_POINTS = 50  # fewer say nothing
 ONE_PLACE = 1e-6  # of the distance to the surface: cameras nearer to each other than this stand at one place
 FARTHEST = 30.0  # radii of the surface, from its middle
 LEAST_SHARED = 0.05  # of what a camera sees, seen by another one too
@@ -42,7 +43,7 @@ def check(views: Sequence[FrameRecord], surface: np.ndarray, read: Callable[[str
             f"all {len(views)} training cameras stand at one place, so nothing has a depth: "
             "the poses were not exported, or the camera only turned; walk around the place, and register the images again"
         )
-    if not len(surface):
+    if len(surface) < FEWEST_POINTS:
         return
     factor = _unit(views, surface, read)
     if factor != 1:

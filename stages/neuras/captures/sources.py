@@ -96,14 +96,14 @@ class Shot:
 
 @dataclass
 class PointSet:
-    """Points in a file, read when they are asked for. read: (P, 3) float32 and the sensor's position (3,) or None.
+    """Points, read when they are asked for. read: (P, 3) float32 and the sensor's position (3,) or None. file: if it is one's.
 
     moment: of the frames that were taken with it; None for what belongs to no one time. facts: what decides the points
     besides the file.
     """
 
     name: str
-    file: Path
+    file: Path | None
     read: Callable[[], tuple[np.ndarray, np.ndarray | None]]
     moment: Hashable = None
     facts: Any = None
@@ -112,7 +112,8 @@ class PointSet:
 @dataclass
 class Inventory:
     """What a reader finds. units and up: None where the set does not say. units_from: where it says so, in words. mesh: the
-    files of the set's own mesh."""
+    files of the set's own mesh. decided_by: files that decide every frame and all points.
+    """
 
     shots: list[Shot]
     sets: list[PointSet] = field(default_factory=list)
@@ -121,6 +122,7 @@ class Inventory:
     units_from: str = "nothing in the set says it"
     up: tuple[float, float, float] | None = None
     mesh: list[Path] = field(default_factory=list)
+    decided_by: list[Path] = field(default_factory=list)
 
 
 def shot_of(name: str, fill: Callable[[Shot], None]) -> Shot:
@@ -161,9 +163,9 @@ def json_in(root: Path, path: Path, kind: type) -> Any:
 class FolderSource:
     """The capture in a folder, by a reader of its kind."""
 
-    def __init__(self, config: FolderConfig, read: Callable[[FolderConfig, Path], Inventory]):
+    def __init__(self, config: FolderConfig, read: Callable[[FolderConfig, Path], Inventory], root: Path | None = None):
         self.config = config
-        self.root = existing_folder("capture.path", config.path, f"capture={config.name} needs a folder")
+        self.root = root or existing_folder("capture.path", config.path, f"capture={config.name} needs a folder")
         self.inventory = read(config, self.root)
         shots = self.inventory.shots
         kept = splits.kept([shot.split for shot in shots], config.every)
@@ -200,7 +202,7 @@ class FolderSource:
         points, sensor = self.sets[id].read()
         finite = np.isfinite(points).all(axis=1)
         if not finite.any():
-            raise Reject("no_points", f"{self.sets[id].file.name} holds no point")
+            raise Reject("no_points", f"{id} holds no point")
         return PointsRecord(id, points[finite].astype(np.float32), sensor)
 
     def mesh(self) -> Mesh | None:
@@ -245,6 +247,7 @@ class FolderSource:
     def hashes(self, hash_file: Callable[[Any], str]) -> dict[str, Any]:
         """What decides the output: per item its files' content and its facts; the mesh's content for the whole."""
         items: dict[str, Any] = {}
+        together = digest_of([hash_file(path) for path in files]) if (files := self.inventory.decided_by) else None
         for id, shot in self.shots.items():
             facts = {
                 "files": [hash_file(path) for path in (shot.image, shot.mask) if path is not None],
@@ -253,10 +256,14 @@ class FolderSource:
                 "said": [self.splits[id], shot.time, shot.name, shot.meta],
                 "fault": shot.fault and [shot.fault.reason, shot.fault.detail],
             }
-            rarer = {"outlines": shot.outlines, "backdrop": _plain(shot.backdrop)}  # left out of the key where there are none
+            rarer = {
+                "outlines": shot.outlines,
+                "backdrop": _plain(shot.backdrop),
+                "all": together,
+            }  # left out where there are none
             items[id] = digest_of(facts | {name: value for name, value in rarer.items() if value})
         for id, it in self.sets.items():
-            content = hash_file(it.file)
+            content = together if it.file is None else hash_file(it.file)
             items[id] = content if it.facts is None else digest_of([content, it.facts])
         tiles = [hash_file(path) for path in self.mesh_files]
         mesh = tiles if len(tiles) > 1 else tiles[0] if tiles else None
