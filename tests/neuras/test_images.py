@@ -128,7 +128,8 @@ def test_pycolmap_places_real_photos_as_it_did_before(tmp_path, shared_data):
         image.resize((450, round(450 * image.height / image.width))).save(tmp_path / "photos" / path.name, quality=92)
     once, again = (run(tmp_path / "photos", tmp_path / f"store{number}") for number in range(2))
     assert len(list(frames(once))) == 8 and len(next(point_sets(once)).points) > 300
-    assert [once.digest_of(row.id) for row in once.rows()] == [again.digest_of(row.id) for row in again.rows()]
+    apart = [a.camera.camera_to_world - b.camera.camera_to_world for a, b in zip(frames(once), frames(again), strict=True)]
+    assert np.abs(apart).max() < 0.01 * CaptureInfo.of(once).radius
 
 
 @needs_pycolmap
