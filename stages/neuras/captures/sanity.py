@@ -86,11 +86,12 @@ def _unit(views: Sequence[FrameRecord], surface: np.ndarray, read: Callable[[str
     for factor in FACTORS:
         looks = [photo.at(surface, factor) for photo in photos]
         pairs = list(zip(looks, looks[apart:], strict=False))
-        likeness = [_correlation(*pair) for pair in pairs if _both(*pair).sum() >= LEAST_POINTS]
+        shared = [int(_both(*pair).sum()) for pair in pairs]
+        likeness = [_correlation(*pair) for pair, number in zip(pairs, shared, strict=True) if number >= LEAST_POINTS]
         if len(likeness) >= len(pairs) / 2:
             agreed[factor] = float(np.median(likeness))
-        elif factor == 1 and any(_both(*pair).any() for pair in pairs):
-            return 1.0  # too few points to know
+        elif factor == 1 and np.median(shared) >= FEWEST_POINTS:
+            return 1.0  # they see the surface, and too little of it to know
     best = max(agreed.values(), default=0.0)
     if best < GOOD or best < agreed.get(1.0, 0.0) + BETTER:
         return 1.0
