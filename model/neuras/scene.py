@@ -17,6 +17,7 @@ from torch import Tensor
 
 from model.neuras import shading, skyboxes
 from model.neuras.baked import Baked
+from model.neuras.exposure import Exposure
 from model.neuras.losses import PerceptualNetwork
 from model.neuras.maps import Maps, blocks, voxels
 from model.neuras.quantization import clusters, nearest
@@ -52,6 +53,7 @@ class FitConfig:
     sky_side: int = 256  # texels along a face of a skybox
     near_opacity: float = 0.12  # of all skyboxes but the farthest, at the start: far layers explain first
     direction_noise: float = 0.0  # sigma added to the view direction
+    exposure: bool = False  # an affine change of colour per training image
     # Runtime: these do not change the result, or only its rounding
     compile: bool = False
     mixed_precision: bool = False
@@ -62,8 +64,11 @@ class FitConfig:
 
     RUNTIME = ("lpips_folder", "compile", "mixed_precision", "log_every", "validate_every", "checkpoint_every")
 
+    LATER = ("exposure",)  # left out where they are not used, so that older states and models stay what they are
+
     def identity(self) -> dict[str, Any]:
-        return {name: value for name, value in dataclasses.asdict(self).items() if name not in self.RUNTIME}
+        values = {name: value for name, value in dataclasses.asdict(self).items() if name not in self.RUNTIME}
+        return {name: value for name, value in values.items() if value or name not in self.LATER}
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +98,7 @@ class Scene:
             torch.manual_seed(config.seed)
             self.mesh_shader = shading.MeshShader(config.shader).to(self.device)
             self.sky_shader = shading.SkyShader(config.shader).to(self.device)
+        self.exposure = Exposure(len(pixels.sizes)).to(self.device) if config.exposure else None
         self.maps = self._start(pixels)
         self.codes: dict[str, Tensor] = {}
         if config.codes:
