@@ -14,6 +14,7 @@ from model.weights import SETS
 from pipeline.commands import add_commands
 from pipeline.errors import INTERRUPTED, UserError, for_people, status_of
 from pipeline.stage import System
+from stages.viewer.command import add_command as add_view
 
 PROGRAM = "lightmill"
 
@@ -74,10 +75,11 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--folder", metavar="DIR", help="where to (default: the user's cache, where all stages look)")
     add_commands(parsers, PROGRAM)
-    for system in systems():
+    known = list(systems())
+    add_view(parsers, PROGRAM, known)
+    for system in known:
         if system.commands:
-            module, _, function = system.commands.partition(":")
-            getattr(importlib.import_module(module), function)(parsers, PROGRAM)
+            system.load(system.commands)(parsers, PROGRAM)
     for sub in parsers.choices.values():
         sub.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show the traceback of an error")
     return parser
