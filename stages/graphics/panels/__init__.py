@@ -136,6 +136,14 @@ class Image:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class Images:
+    """HDR images of one view side by side, under one exposure and tone mapper. images: Lazy each, that give an `Image`."""
+
+    title: str
+    images: Mapping[str, Lazy]
+
+
 @dataclass(frozen=True)
 class Photo:
     """An 8-bit picture. record: of the same artifact, or of the one named ``artifact``; its member."""

@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from stages.graphics.panels import Curves, Facts, Image, Lazy, Page, Pane, Pictures, Shown, Space, Surface, Video, Words
+from stages.graphics.panels import Curves, Facts, Image, Images, Lazy, Page, Pane, Pictures, Shown, Space, Surface, Video, Words
 
 PICTURES = (".png", ".jpg", ".jpeg")
 MOST_TEXT = 200_000  # characters of a file that are shown
@@ -37,16 +37,15 @@ def _members(shown: Shown, names: list[str]) -> Iterator[Any]:
     pictures = {name.rpartition(".")[0]: name for name in names if name.endswith(PICTURES)}
     if pictures:
         yield Pictures("Pictures", pictures)
+    hdr = {name.removesuffix(".exr"): lazy_hdr(shown, name) for name in names if name.endswith(".exr")}
+    if hdr:
+        yield Images("Images", hdr)
     for name in names:
-        if name.endswith(".exr"):
-            yield Lazy(lambda name=name: hdr_image(name.removesuffix(".exr"), _bytes(shown, name)))
-        elif name.endswith(".npz"):
+        if name.endswith(".npz"):
             yield from _arrays(shown, name)
         elif name.endswith(".json"):
             yield Facts(name, json.loads(_bytes(shown, name)))
-        elif name.endswith(PICTURES):
-            pass
-        else:
+        elif not name.endswith((".exr", *PICTURES)):
             yield Words(name, _bytes(shown, name)[:MOST_TEXT].decode("utf-8", "replace"))
 
 
@@ -61,6 +60,11 @@ def _arrays(shown: Shown, name: str) -> Iterator[Any]:
     if {"vertices", "faces"} <= arrays.keys() and arrays["vertices"].ndim == 2 and arrays["vertices"].shape[1] == 3:
         yield Space(name, [Pane(name, [Surface(name, arrays["vertices"], arrays["faces"])])])
     yield Facts(name, {key: f"{array.dtype} {tuple(array.shape)}" for key, array in arrays.items()})
+
+
+def lazy_hdr(shown: Shown, member: str) -> Lazy:
+    """The image of an EXR member, read when it is looked at."""
+    return Lazy(lambda: hdr_image(member.removesuffix(".exr"), _bytes(shown, member)))
 
 
 def hdr_image(title: str, data: bytes) -> Image:

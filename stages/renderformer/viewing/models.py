@@ -11,6 +11,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,18 +47,32 @@ def trained(shown: Shown) -> Iterator[Any]:
 # --- what a request names -----------------------------------------------------------------------------------------------
 
 
-def checkpoints(context: Context, arguments: Mapping[str, Any]) -> list[dict[str, str]]:
+def checkpoints(context: Context, arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The checkpoints at hand: the one given to the viewer first, then those of the store, the newest first, then the one
-    that ships."""
-    from stages.renderformer.inference.renderer import PRETRAINED
+    that ships. ``resolution``: pixels per side that it was trained with."""
+    from stages.renderformer.inference.renderer import PRETRAINED, checkpoint_folder
 
-    out = [] if context.checkpoint is None else [{"id": context.checkpoint, "name": context.checkpoint}]
+    store = context.store.root if context.store is not None else "store"
+    ids = [] if context.checkpoint is None else [context.checkpoint]
     if context.store is not None:
-        trained = reversed(context.store.artifacts("train"))
-        out += [{"id": artifact.name, "name": artifact.name} for artifact in trained if artifact.name != context.checkpoint]
+        ids += [made.name for made in reversed(context.store.artifacts("train")) if made.name != context.checkpoint]
+    folders = {id: checkpoint_folder(id, store) for id in ids}
     if (PRETRAINED / "config.json").is_file():
-        out.append({"id": SHIPPED, "name": "the model that ships"})
-    return out
+        folders[SHIPPED] = PRETRAINED
+    return [
+        {"id": id, "name": id or "the model that ships", "resolution": trained_resolution(folder)}
+        for id, folder in folders.items()
+    ]
+
+
+def trained_resolution(folder: Path) -> int:
+    """Pixels per side that the checkpoint was trained with, without reading its weights."""
+    from safetensors import safe_open
+
+    from stages.renderformer.inference.limits import resolution_limit
+
+    with safe_open(folder / "model.safetensors", "np") as file:
+        return resolution_limit(file.metadata() or {})
 
 
 def renderer(context: Context, checkpoint: Any) -> Renderer:

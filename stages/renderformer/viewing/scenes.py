@@ -12,7 +12,7 @@ from pipeline.store import Artifact
 from stages.graphics.arrays import unpack_json
 from stages.graphics.cameras import Camera
 from stages.graphics.exr import decode_lights
-from stages.graphics.panels import Eye, Facts, Image, Lazy, Pane, Shown, Space, Surface, general
+from stages.graphics.panels import Eye, Facts, Image, Images, Lazy, Pane, Shown, Space, Surface, general
 from stages.graphics.tonemap import exposure_for
 from stages.renderformer.dataset.encoding import decode_scene
 from stages.renderformer.records import SceneRecord
@@ -108,15 +108,14 @@ def predicted(shown: Shown) -> Iterator[Any]:
     if shown.record_id is None or shard is None or shown.record_id not in shard:
         yield from general.panels(shown)
         return
-    truth = Shown(shown.store, shard, shown.record_id)
-    for name in shown.members():
+    truth, names = Shown(shown.store, shard, shown.record_id), list(shown.members())
+    for name in names:
         view, _, rest = name.partition(".")
         if rest == "prediction.exr" and f"{view}.exr" in truth.members():
             number = int(view.removeprefix("view"))
-            yield lazy_image(shard, shown.record_id, number)
-        if name.endswith(".exr"):
-            yield Lazy(lambda name=name: general.hdr_image(name.removesuffix(".exr"), shown.record((name,)).members[name]))
-    yield from general.panels(shown, [name for name in shown.members() if name.endswith(".exr")])
+            pair = {"path traced": lazy_image(shard, shown.record_id, number), "predicted": general.lazy_hdr(shown, name)}
+            yield Images(f"View {number}", pair)
+    yield from general.panels(shown, [name for name in names if name.endswith(".prediction.exr")])
 
 
 def check_record(artifact: Artifact) -> None:

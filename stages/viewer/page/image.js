@@ -236,14 +236,24 @@ export const lightControls = (count, set, get) => {
   return list;
 };
 
-// A panel of its own: picture, controls, and the pixel under the pointer.
-export const imagePanel = (image) => {
-  const view = new ImageView(image);
-  const told = h("p", { class: "told", "aria-live": "off" }, " ");
-  view.canvas.addEventListener("pointermove", (event) => {
-    const box = view.canvas.getBoundingClientRect();
-    told.textContent = view.at(Math.floor(((event.clientX - box.left) / box.width) * view.canvas.width), Math.floor(((event.clientY - box.top) / box.height) * view.canvas.height)) || " ";
-  });
-  const element = h("div", { class: "split" }, h("div", { class: "picture" }, view.canvas, told), imageControls(view));
-  return Object.assign(element, { view, free: () => view.free() });
+// One image.
+export const imagePanel = (image) => imagesPanel({ [image.title]: image });
+
+// Images of one view side by side, {caption: image}: one exposure, tone mapper and layer for all; lights for those that have them.
+export const imagesPanel = (images) => {
+  const views = Object.values(images).map((image) => new ImageView(image)), lead = views.find((view) => Object.keys(view.image.layers).length) ?? views[0];
+  const told = h("p", { class: "told" }, " ");
+  for (const view of views) {
+    view.exposure = lead.exposure;
+    view.draw();
+    view.canvas.addEventListener("pointermove", (event) => {
+      const box = view.canvas.getBoundingClientRect(), x = Math.floor(((event.clientX - box.left) / box.width) * view.canvas.width), y = Math.floor(((event.clientY - box.top) / box.height) * view.canvas.height);
+      told.textContent = view.at(x, y) || " ";
+    });
+  }
+  const follow = () => { for (const view of views) if (view !== lead) { view.exposure = lead.exposure; view.mapper = lead.mapper; view.draw(); } };
+  const figures = Object.keys(images).map((caption, i) => h("figure", {}, views[i].canvas, h("figcaption", {}, caption)));
+  const element = h("div", { class: "split images" }, h("div", { class: "main" }, h("div", { class: "stage" }, figures), told), imageControls(lead, { changed: follow }));
+  element.style.setProperty("--panes", String(views.length));
+  return Object.assign(element, { views, free: () => views.forEach((view) => view.free()) });
 };

@@ -65,10 +65,17 @@ export class Model {
       const wanted = this.space.page.query.get("model");
       this.model = all.find(({ id }) => id === wanted)?.id ?? all[0]?.id;
       if (!all.length) { this.checkpoint.replaceChildren(h("p", { class: "soft" }, "No model: train one, or give --checkpoint.")); return; }
+      const pixels = choice("Pixels per side", SIZES.map((n) => [String(n), String(n)]), String(this.size), (n) => { this.size = +n; this.rested(); }, "size");
+      const trained = () => { // the picture is as large as those that the model was trained with
+        const { resolution } = all.find(({ id }) => id === this.model);
+        this.size = SIZES.reduce((a, b) => (Math.abs(b - resolution) < Math.abs(a - resolution) ? b : a));
+        pixels.select.value = String(this.size);
+      };
+      trained();
       this.checkpoint.replaceChildren(
-        choice("Model", all.map(({ id, name }) => [id, name]), this.model, (id) => { this.model = id; this.rested(); }, "checkpoint"),
-        choice("Pixels per side", SIZES.map((n) => [String(n), String(n)]), String(this.size), (n) => { this.size = +n; this.rested(); }, "size"),
-        choice("Samples per pixel, path traced", [16, 64, 256, 1024].map((n) => [String(n), String(n)]), String(this.spp), (n) => { this.spp = +n; this.rested(); }, "spp"));
+        choice("Model", all.map(({ id, name }) => [id, name]), this.model, (id) => { this.model = id; trained(); this.rested(); }, "checkpoint"),
+        pixels,
+        choice("Paths per pixel", [16, 64, 256, 1024].map((n) => [String(n), String(n)]), String(this.spp), (n) => { this.spp = +n; this.rested(); }, "spp"));
       this.known = true;
       await this.rested();
     } catch (error) { this.checkpoint.replaceChildren(failure(error)); }

@@ -1,6 +1,6 @@
 // Panels, as stages.graphics.panels has them, as elements. `page` says what they belong to.
 import { failure, h, number, slider } from "./data.js";
-import { imagePanel } from "./image.js";
+import { imagePanel, imagesPanel } from "./image.js";
 import { plots } from "./plots.js";
 import { Space } from "./space.js";
 
@@ -45,7 +45,19 @@ const KINDS = {
     h("iframe", { src: page.source(file), title: file, loading: "lazy", sandbox: file.endsWith("index.html") ? "allow-scripts allow-same-origin" : "allow-scripts" })),
   video: ({ file }, page) => h("video", { src: page.source(file), controls: true, loop: true, preload: "metadata" }),
   curves: ({ title, series }) => plots({ [title]: series }),
-  image: (panel) => imagePanel(panel),
+  image: imagePanel,
+  images: ({ images }, page) => {
+    const box = h("div", {}, h("p", { class: "soft" }, "loading .."));
+    const load = async () => {
+      const loaded = Object.fromEntries(await Promise.all(Object.entries(images).map(async ([caption, { lazy }]) => [caption, await page.load(lazy)])));
+      const element = imagesPanel(loaded);
+      page.freed.push(element.free);
+      box.replaceChildren(element);
+      box.views = element.views;
+    };
+    page.pending.push(load().catch((error) => box.replaceChildren(failure(error))));
+    return box;
+  },
   space: (panel, page) => {
     const space = new Space(panel, page);
     space.ready = space.ready.catch((error) => { space.element.replaceChildren(failure(error)); });
