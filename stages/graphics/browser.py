@@ -16,7 +16,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -56,7 +56,7 @@ class Page:
     def __init__(self, devtools: _DevTools, size: tuple[int, int], mobile: bool = False):
         target = devtools.ask("Target.createTarget", None, url="about:blank")["targetId"]
         self._session = devtools.ask("Target.attachToTarget", None, targetId=target, flatten=True)["sessionId"]
-        self._devtools = devtools
+        self._devtools, self._forgotten = devtools, set()
         self.resize(size, mobile)
         for domain in ("Page", "Runtime", "Log"):
             self.ask(f"{domain}.enable")
@@ -78,7 +78,11 @@ class Page:
                 found.append(" ".join(str(word.get("value", word.get("description"))) for word in facts["args"]))
             elif event["method"] == "Log.entryAdded" and facts["entry"]["level"] in ("error", "warning"):
                 found.append(f"{facts['entry']['text']} {facts['entry'].get('url', '')}".strip())
-        return found
+        return [problem for problem in found if problem not in self._forgotten]
+
+    def forget(self, problems: Sequence[str]) -> None:
+        """Leave these out of ``problems`` from now on."""
+        self._forgotten |= set(problems)
 
     def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
         return self._devtools.ask(method, self._session, **parameters)
