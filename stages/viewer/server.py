@@ -4,7 +4,7 @@ Python's own ``http.server`` does all that is asked here: a few dozen small answ
 the server trusts no request. It answers only where the Host header names this server (a page elsewhere whose name was made to
 point here has another), takes requests that change or compute something only as JSON from its own pages, and forbids its pages
 to load anything from elsewhere (Content-Security-Policy). Names of artifacts, records and files are looked up, never joined to
-a path unseen (``pages``).
+a path unseen (``pages``). Files of artifacts, whose pages have no origin, lie behind a word that only the viewer's pages know.
 
 Numerical work (torch, Mitsuba) is done by one thread, one request after the other.
 """
@@ -15,6 +15,7 @@ import ipaddress
 import json
 import mimetypes
 import re
+import secrets
 import socket
 import sys
 import threading
@@ -39,9 +40,9 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; media-src 'self'; "
     f"connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self' {NOTEBOOKS}"
 )
-# of an artifact's own pages: reports are one file and get no origin; a site (index.html) reads the files beside it
+# An artifact's own pages (a report, a site) run without an origin: they reach the files beside them, and nothing else here.
 FILES_POLICY = (
-    "default-src 'self' 'unsafe-inline' data: blob:; connect-src 'self' data: blob:; base-uri 'none'; "
+    "default-src 'self' 'unsafe-inline' data: blob:; base-uri 'none'; form-action 'none'; "
     f"frame-ancestors 'self' {NOTEBOOKS}; sandbox allow-scripts"
 )
 RANGE = re.compile(r"bytes=(\d*)-(\d*)\Z")
@@ -62,6 +63,7 @@ class Viewer:
     def __init__(self, context: Context, systems: Sequence[System], start: str = ""):
         self.context, self.systems, self.start = context, list(systems), start
         self.pages = Pages(context.store, systems) if context.store is not None else None
+        self.word = secrets.token_urlsafe(16)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="numerical work")
 
     def panels(self, artifact: str, record: str | None) -> list[Any]:
@@ -87,7 +89,8 @@ class Viewer:
         start = int(query["start"]) if query.get("start", "0").isdecimal() and "start" in query else 0
         if name == "start":
             path = self.context.path
-            return {"start": self.start, "file": None if path is None else path.name, "store": self.pages is not None}
+            facts = {"start": self.start, "file": None if path is None else path.name, "store": self.pages is not None}
+            return {**facts, "word": self.word}
         if name == "panels":
             return pack(self.panels(artifact, record))
         if name == "lazy":
@@ -216,7 +219,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise Refused(421, "this server answers to its own address only")
         site, mode = self.headers.get("Sec-Fetch-Site", "none"), self.headers.get("Sec-Fetch-Mode", "navigate")
         if site not in ("none", "same-origin") and not (mode == "navigate" and self.command == "GET" and self.path == "/"):
-            if site == "cross-site" and self.headers.get("Sec-Fetch-Dest") != "empty" and self.path.startswith("/files/"):
+            if self.path.startswith(f"/files/{self.server.viewer.word}/"):
                 return  # a page of an artifact, which has no origin of its own, loads what lies beside it
             raise Refused(403, "this was asked by another web site")
 
@@ -250,13 +253,11 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(shown.record((member,)).members[member], type_of(member), FILES_POLICY)
 
     def _file(self, path: str) -> None:
-        """``/files/<artifact>/<-12 hex>/files/..``: a file that the artifact's manifest lists."""
-        match = re.match(r"(.*?-[0-9a-f]{12})/(.+)\Z", path)
-        if not match:
-            raise Refused(404, f"there is no file {path}")
-        file = self.server.viewer._pages().file(match[1], match[2])
-        site = file.name == "index.html"
-        policy = FILES_POLICY.replace("allow-scripts", "allow-scripts allow-same-origin") if site else FILES_POLICY
+        """``/files/<word>/<artifact>/..``: a file that the artifact's manifest lists."""
+        match = re.match(r"([^/]+)/(.*?-[0-9a-f]{12})/(.+)\Z", path)
+        if not match or not secrets.compare_digest(match[1], self.server.viewer.word):
+            raise Refused(404, "there is no such file")
+        file = self.server.viewer._pages().file(match[2], match[3])
         size = file.stat().st_size
         first, last, status = 0, size - 1, 200
         if (wanted := RANGE.match(self.headers.get("Range", ""))) and size and wanted.group(0) != "bytes=-":
@@ -265,7 +266,8 @@ class _Handler(BaseHTTPRequestHandler):
             if first > last:
                 raise Refused(416, f"{path} has {size} bytes")
             status = 206
-        self._head(status, type_of(file.name), last - first + 1, policy)
+        self._head(status, type_of(file.name), last - first + 1, FILES_POLICY)
+        self.send_header("Access-Control-Allow-Origin", "null")
         if status == 206:
             self.send_header("Content-Range", f"bytes {first}-{last}/{size}")
         self.send_header("Accept-Ranges", "bytes")

@@ -64,8 +64,8 @@ def commit(
     for name, data in (files or {}).items():
         (draft.files / name).parent.mkdir(parents=True, exist_ok=True)
         (draft.files / name).write_bytes(data)
-    outputs = draft.outputs()
-    manifest = {**ORIGIN, "key": draft.key, "preimage": preimage, "outputs": outputs, "summary": {}, "system": system or "renderformer"}
+    manifest = {**ORIGIN, "key": draft.key, "preimage": preimage, "outputs": draft.outputs(), "summary": {}}
+    manifest |= {"system": system or "renderformer"}
     return store.commit(draft, "small", manifest)
 
 
@@ -112,7 +112,9 @@ def renderformer(root: Path) -> dict[str, Artifact]:
     pages = {"report.html": b"<!doctype html><title>report</title><script>document.title = 'read'</script>"}
     judged = [Record(sample.id, scores) for sample in test]
     made["evaluate"] = commit(root, "evaluate", judged, {"shard": made["shard"], "train": made["train"]}, pages)
-    probed = [Record("test-1", {"metrics.json": pack_json({}), "reference.exr": encode_rgb(image), "method0.exr": encode_rgb(image)})]
+    probed = [
+        Record("test-1", {"metrics.json": pack_json({}), "reference.exr": encode_rgb(image), "method0.exr": encode_rgb(image)})
+    ]
     made["probe"] = commit(root, "probe", probed, {"shard": made["shard"]}, {"figure.png": png(4), "table.md": b"| a |"})
     return made
 

@@ -21,7 +21,7 @@ const pageOf = (query, artifact, record) => ({
   artifact,
   system: artifact && artifact.split("/").length === 3 ? artifact.split("/")[0] : "renderformer",
   load: (path) => ask("lazy", { artifact: artifact ?? "", record: record ?? "", path }),
-  source: (name) => (record ? `/member/${pathOf(artifact)}/${record}/${name}` : `/files/${pathOf(artifact)}/${pathOf(name)}`),
+  source: (name) => (record ? `/member/${pathOf(artifact)}/${record}/${name}` : `/files/${start.word}/${pathOf(artifact)}/${pathOf(name)}`),
   photo: (photo) => `/member/${pathOf(photo.artifact)}/${photo.record}/${photo.member}`,
 });
 

@@ -316,7 +316,7 @@ export class Model {
         this.space.recolour();
       };
       this.layer?.remove();
-      this.layer = h("div", {}, slider("Attention, layer", { min: 1, max: layers, step: 1, value: layers, id: "layer", on: (v) => show(v - 1) }),
+      this.layer = h("div", {}, slider("Attention, layer", { min: 1, max: layers, step: 1, value: layers, id: "attention-layer", on: (v) => show(v - 1) }),
         h("button", { type: "button", onclick: () => { this.space.attention = null; this.layer.remove(); this.space.recolour(); } }, "Without attention"));
       this.space.boxes.model.append(this.layer);
       await this.space.use("preview");

@@ -42,7 +42,7 @@ const KINDS = {
   words: ({ text }) => h("pre", {}, text),
   pictures,
   page: ({ file }, page) => h("div", {}, h("p", {}, h("a", { href: page.source(file), target: "_blank" }, "Open in a tab of its own")),
-    h("iframe", { src: page.source(file), title: file, loading: "lazy", sandbox: file.endsWith("index.html") ? "allow-scripts allow-same-origin" : "allow-scripts" })),
+    h("iframe", { src: page.source(file), title: file, loading: "lazy", sandbox: "allow-scripts" })),
   video: ({ file }, page) => h("video", { src: page.source(file), controls: true, loop: true, preload: "metadata" }),
   curves: ({ title, series }) => plots({ [title]: series }),
   image: imagePanel,
