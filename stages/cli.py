@@ -3,29 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
-import pkgutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
-import stages
 from model.weights import SETS
 from pipeline.commands import add_commands
 from pipeline.errors import INTERRUPTED, UserError, for_people, status_of
-from pipeline.stage import System
+from stages import systems
 from stages.viewer.command import add_command as add_view
 
 PROGRAM = "lightmill"
-
-
-def systems() -> Iterator[System]:
-    """The project's systems: the packages of ``stages`` that supply one."""
-    for module in pkgutil.iter_modules(stages.__path__):
-        if module.ispkg:
-            system = getattr(importlib.import_module(f"stages.{module.name}"), "SYSTEM", None)
-            if isinstance(system, System):
-                yield system
 
 
 def command_run(arguments: argparse.Namespace) -> int:

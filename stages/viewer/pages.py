@@ -192,7 +192,7 @@ class Pages:
         }
 
     def _same(self, artifact: Artifact, record_id: str) -> list[dict[str, str]]:
-        """Records of that id in the artifacts that this one was made from, nearest first."""
+        """Records of that id in the artifacts that this one was made from, the last made first."""
         out, seen, todo = [], set(), list(artifact.manifest["preimage"]["inputs"].items())
         while todo:
             role, key = todo.pop(0)
@@ -201,9 +201,10 @@ class Pages:
             if parent is not None:
                 parent = self.artifact(parent.path.relative_to(self.store.root).as_posix())
                 if record_id in parent:
-                    out.append({"artifact": parent.name, "stage": parent.stage, "role": role})
+                    same = {"artifact": parent.name, "stage": parent.stage, "role": role}
+                    out.append((parent.manifest["finished"], same))
                 todo += parent.manifest["preimage"]["inputs"].items()
-        return out
+        return [same for _, same in sorted(out, key=lambda entry: -entry[0])]
 
     def rejects(self, name: str, start: int = 0, reason: str = "") -> dict[str, Any]:
         """A page of an artifact's rejects; those of that reason."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from stages.cli import systems
+from pipeline.status import RunState
+from pipeline.store import Store
+from stages import systems
 from stages.graphics import browser
 from stages.graphics.exr import decode_lights
 from stages.graphics.tonemap import TONE_MAPPERS, srgb_decode, to_picture
@@ -126,6 +129,28 @@ def test_a_reject_is_shown_with_the_mesh_that_it_was_made_from(page, store):
     page.until(f"document.querySelector('h1')?.textContent === 'ball-1' && {SPACE}?.panes?.length === 2")
     page.until(SETTLED)
     assert "kept 1 % of it" in page.value("document.querySelector('main').textContent")
+
+
+def test_a_running_stage_is_followed(page, store):
+    made = Store(store[0])
+    key = "ab" * 32
+    draft = made.draft("render", key, {"stage": "render", "version": 1, "params": {}, "inputs": {}})
+    claim = made.claim("render", key)
+    assert claim.take()
+    try:
+        state = RunState(draft.path, total=20, done=5, reused=0, parts=5)
+        state.add_rejects({"dark": 2})
+        state.update(now=True)
+        go(page, "#/")
+        page.until("document.querySelector('#runs')?.textContent.includes('5 of 20 items')")
+        assert "2 dark" in page.value("document.querySelector('#runs').textContent")
+        state.update(now=True, done=6)
+        page.until("document.querySelector('#runs').textContent.includes('6 of 20 items')")
+        assert page.value("document.querySelector('#runs progress').value") == 6
+    finally:
+        claim.release()
+        shutil.rmtree(draft.path)
+    page.until("document.querySelector('#runs').childElementCount === 0")  # the page follows that, too
 
 
 def test_what_does_not_exist_is_told_on_the_page(page, store):

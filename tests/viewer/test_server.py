@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import socket
+import urllib.request
 from urllib.parse import quote
 
 import numpy as np
@@ -12,7 +13,8 @@ import pytest
 
 from pipeline.errors import UserError
 from pipeline.store import Store
-from stages.cli import main, systems
+from stages import systems
+from stages.cli import main
 from stages.graphics.exr import decode_lights
 from stages.graphics.panels import Context, Facts, Lazy, general, pack, resolve, unpack
 from stages.renderformer.records import SceneRecord
@@ -278,6 +280,23 @@ def test_what_names_an_artifact_a_record_or_a_file(store, tmp_path):
     (tmp_path / "ball.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     assert start(str(tmp_path / "ball.obj")) == "#/file"
     assert viewer_of(str(rf["shard"].path), str(tmp_path / "none"), systems=list(systems())).context.store.root == root
+
+
+def test_a_notebook_gets_a_frame_of_its_own_server(store):
+    import lightmill
+
+    frame = lightmill.view("shard", store=store[0], height=500)
+    try:
+        page = frame._repr_html_()
+        assert f'src="{frame.address}"' in page and "500px" in page and frame.address.startswith("http://127.0.0.1:")
+        address = frame.address.partition("#")[0]
+        with urllib.request.urlopen(address) as answer:  # as a notebook's frame
+            assert "frame-ancestors 'self' http://localhost:*" in answer.headers["Content-Security-Policy"]
+        assert frame.address.endswith(store[1]["shard"].name)
+    finally:
+        frame.close()
+    with pytest.raises(UserError):
+        lightmill.view("nowhere", store=store[0])
 
 
 # -- values as bytes, and edits

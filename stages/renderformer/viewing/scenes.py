@@ -45,8 +45,8 @@ def space(scene: SceneRecord, images: Mapping[int, Lazy], reference: Mapping[str
     objects = [{"name": entry.get("name", f"object {i}"), "kind": entry.get("kind", "object")}
                for i, entry in enumerate(scene.meta.get("objects", ()))]  # fmt: skip
     note = "Textures are shown as the mean of each triangle." if scene.textured else ""
-    first = min(images, default=None)
-    return Space(title, [pane], eye=first, note=note, objects=objects, scene=dict(reference))
+    first = min(images, default=0)
+    return Space(title, [pane], eye=first if len(scene.fov_deg) else None, note=note, objects=objects, scene=dict(reference))
 
 
 def surface(scene: SceneRecord) -> Surface:

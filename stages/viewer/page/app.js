@@ -1,5 +1,5 @@
 // The viewer's pages, by the address behind #: the store, an artifact, a record, a reject, runs, a file.
-import { ask, bytes, duration, failure, h, pathOf, put } from "./data.js";
+import { ask, bytes, count, duration, failure, h, pathOf, put } from "./data.js";
 import { drawPanels, facts } from "./panels.js";
 import { lineage, plots } from "./plots.js";
 
@@ -33,7 +33,7 @@ const card = (artifact) => {
   const { folder } = nameParts(artifact.name), lost = rejectCount(artifact.rejects);
   return h("a", { class: "card", href: `#/artifact/${artifact.name}` },
     h("strong", {}, folder.replace(/-[0-9a-f]{12}$/, "")), h("code", {}, artifact.key.slice(0, 12)),
-    h("span", {}, artifact.items ? `${artifact.records.toLocaleString("en")} records` : "files"),
+    h("span", {}, artifact.items ? count(artifact.records) : "files"),
     lost ? h("span", { class: "bad" }, `${lost.toLocaleString("en")} rejected`) : "",
     h("span", { class: "soft" }, `${bytes(artifact.bytes)}, ${duration(artifact.age_s)} ago${artifact.pinned ? ", pinned" : ""}`));
 };

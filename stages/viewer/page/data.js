@@ -78,6 +78,8 @@ export const bytes = (n) => {
   return `${n.toFixed(1)} TB`;
 };
 
+export const count = (n) => `${n.toLocaleString("en")} ${n === 1 ? "record" : "records"}`;
+
 export const duration = (seconds) => {
   if (seconds < 90) return `${seconds < 10 ? seconds.toFixed(1) : Math.round(seconds)} s`;
   if (seconds < 5400) return `${Math.round(seconds / 60)} min`;

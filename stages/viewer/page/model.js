@@ -42,7 +42,7 @@ export class Model {
 
   build() {
     this.shows = h("div", { class: "shows", role: "radiogroup", "aria-label": "What is shown" }, SHOWS.map(([key, text], i) =>
-      h("button", { type: "button", role: "radio", "aria-checked": String(key === this.space.source), "data-show": key, title: `key ${i + 1}`, onclick: () => this.space.use(key) }, text)));
+      h("button", { type: "button", role: "radio", "aria-checked": String(key === this.space.source), "data-show": key, title: `key ${i + 1}`, disabled: key === "stored" && !this.space.eyes.some((eye) => eye.image), onclick: () => this.space.use(key) }, text)));
     const { boxes } = this.space;
     boxes.shows.append(this.shows);
     this.checkpoint = h("div", {});

@@ -1,5 +1,5 @@
 // Curves over steps, and the graph of a store's artifacts, as SVG.
-import { bytes, h, number, s } from "./data.js";
+import { bytes, count, h, number, s } from "./data.js";
 
 const COLOURS = ["#4c8dd6", "#e08a2e", "#3aa673", "#b66bd1", "#d1566a", "#8a8f2b", "#2aa7b8", "#a3765a"];
 const WIDTH = 640, HEIGHT = 240, LEFT = 62, BOTTOM = 28, TOP = 10, RIGHT = 12;
@@ -66,8 +66,8 @@ export const lineage = (artifacts, systems, here) => {
   }));
   const boxes = [...place].map(([artifact, [x, y]]) => s("a", { href: `#/artifact/${artifact.name}`, class: artifact === here ? "here" : "" },
     s("rect", { x, y, width: wide, height: high, rx: 7 }),
-    s("text", { x: x + 9, y: y + 20 }, artifact.name.split("/").pop().replace(/-[0-9a-f]{12}$/, "").replace(/^(.{14}).{2,}$/, "$1…")),
-    s("text", { x: x + 9, y: y + 37, class: "small" }, artifact.items ? `${artifact.records.toLocaleString("en")} records` : bytes(artifact.bytes)),
+    s("text", { x: x + 9, y: y + 20 }, artifact.name.split("/").pop().replace(/-[0-9a-f]{12}$/, "").replace(/^(.{12}).{2,}$/, "$1…")),
+    s("text", { x: x + 9, y: y + 37, class: "small" }, artifact.items ? count(artifact.records) : bytes(artifact.bytes)),
     s("title", {}, `${artifact.name}`)));
   const heads = columns.map((column, i) => s("text", { x: i * (wide + gap) + 2, y: 14, class: "head" }, column.stage));
   const width = columns.length * (wide + gap) - gap + 2;

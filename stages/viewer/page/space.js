@@ -31,7 +31,7 @@ export class Space {
     this.scene = panel.scene !== null;
     this.eye = null;
     this.mode = this.scene ? "preview" : panel.flat ? "chart" : "shaded";
-    this.source = "stored";
+    this.source = panel.panes[0].eyes.some((eye) => eye.image) ? "stored" : "preview";
     this.opacity = 1;
     this.view = new ImageView();
     this.photo = h("img", { alt: "", class: "image" });
