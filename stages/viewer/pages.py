@@ -173,10 +173,14 @@ class Pages:
         }  # fmt: skip
 
     def beside(self, name: str, record_id: str) -> dict[str, Any]:
-        """One record: its members, its neighbours, and records of the same id in other artifacts of the line."""
+        """One record: its members, its neighbours, and records of the same id in other artifacts of the line.
+
+        Damaged where its bytes are not those that were written.
+        """
         artifact = self.artifact(name)
         rows = artifact.rows()
         row = artifact.row(record_id)
+        artifact.read(record_id)  # as a whole, which compares its digest
         number = rows.number(record_id)
         near = {"previous": number - 1, "next": number + 1}
         return {

@@ -20,6 +20,7 @@ import socket
 import sys
 import threading
 import traceback
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -47,6 +48,7 @@ FILES_POLICY = (
 )
 RANGE = re.compile(r"bytes=(\d*)-(\d*)\Z")
 CHUNK = 1 << 20
+KEPT_PANELS = 4  # of artifacts and records
 
 
 class Refused(Exception):
@@ -64,6 +66,7 @@ class Viewer:
         self.context, self.systems, self.start = context, list(systems), start
         self.pages = Pages(context.store, systems) if context.store is not None else None
         self.word = secrets.token_urlsafe(16)
+        self._shown: OrderedDict[tuple[str, str | None], list[Any]] = OrderedDict()  # panels whose values may be asked for
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="numerical work")
 
     def panels(self, artifact: str, record: str | None) -> list[Any]:
@@ -77,6 +80,15 @@ class Viewer:
         shown = self._pages().shown(artifact, record)
         show = self.pages.views(shown.artifact)
         return list(show(shown) if show is not None else general.panels(shown))
+
+    def _remembered(self, artifact: str, record: str | None) -> list[Any]:
+        """The panels as they were last made: a page asks for what is Lazy in them one by one."""
+        panels = self._shown.get((artifact, record))
+        if panels is None:
+            panels = self._shown[artifact, record] = self.panels(artifact, record)
+            while len(self._shown) > KEPT_PANELS:
+                self._shown.popitem(last=False)
+        return panels
 
     def _pages(self) -> Pages:
         if self.pages is None:
@@ -92,10 +104,10 @@ class Viewer:
             facts = {"start": self.start, "file": None if path is None else path.name, "store": self.pages is not None}
             return {**facts, "word": self.word}
         if name == "panels":
-            return pack(self.panels(artifact, record))
+            self._shown.pop((artifact, record), None)
+            return pack(self._remembered(artifact, record))
         if name == "lazy":
-            value = resolve(self.panels(artifact, record), query.get("path", ""))
-            return pack(value)
+            return pack(resolve(self._remembered(artifact, record), query.get("path", "")))
         pages = self._pages()
         if name == "store":
             return pages.overview()

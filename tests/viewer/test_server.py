@@ -225,6 +225,10 @@ def test_a_damaged_part_and_a_damaged_manifest_are_told(tmp_path):
     with Server(viewer) as server:
         server.serve_in_background()
         (part,) = (made.path / "parts").iterdir()
+        sound = part.read_bytes()
+        part.write_bytes(sound.replace(b"{}", b"[]"))  # as many bytes, but others
+        status, _, data = ask(server, f"/api/record?artifact={made.name}&record=one")
+        assert status == 409 and "is changed at record one; `lightmill repair" in json.loads(data)["error"]
         part.write_bytes(b"cut")
         status, _, data = ask(server, f"/api/panels?artifact={made.name}&record=one")
         assert status in (400, 409) and "repair" in json.loads(data)["error"] or "cut off" in json.loads(data)["error"]

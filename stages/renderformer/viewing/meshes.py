@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,9 +10,8 @@ import numpy as np
 from stages.graphics.arrays import unpack_json
 from stages.graphics.geometry.records import MeshRecord, TextureRecord
 from stages.graphics.panels import Facts, Lazy, Pane, Shown, Space, Surface, general
+from stages.renderformer.inference.room import Z_UP
 from stages.renderformer.objects.rungs import load_rungs
-
-UP = (0.0, 1.0, 0.0)  # of most files; collect keeps a file's own axes
 
 
 def collected(shown: Shown) -> Iterator[Any]:
@@ -25,7 +24,7 @@ def collected(shown: Shown) -> Iterator[Any]:
     colours = {}
     if beside in shown.artifact and "texture.npz" in shown.artifact.row(beside).members:
         colours["base colour"] = face_colours(TextureRecord.from_record(shown.artifact.read(beside)))
-    yield Space("Mesh", [Pane("collected", [surface("collected", mesh.vertices, mesh.faces, colours)])], UP)
+    yield Space("Mesh", [Pane("collected", [surface("collected", mesh.vertices, mesh.faces, colours)])], up_of(mesh.meta))
     yield Facts("Facts", mesh.meta)
 
 
@@ -36,7 +35,7 @@ def remeshed(shown: Shown) -> Iterator[Any]:
         return
     mesh = MeshRecord.from_record(shown.record())
     panes = [*original(shown), Pane("remeshed", [surface("remeshed", mesh.vertices, mesh.faces)])]
-    yield Space("Original and result", panes, UP)
+    yield Space("Original and result", panes, up_of(mesh.meta))
     yield Facts("Facts", mesh.meta)
 
 
@@ -62,8 +61,14 @@ def decimated(shown: Shown) -> Iterator[Any]:
         mesh = MeshRecord.from_record(remesh.read(shown.record_id))
         panes.append(Pane("remeshed", [surface("remeshed", mesh.vertices, mesh.faces)]))
         panes = [*original(Shown(shown.store, remesh, shown.record_id)), *panes]
-    yield Space("The ladder of rungs", [*panes, Pane("decimated", rungs)], UP)
+    yield Space("The ladder of rungs", [*panes, Pane("decimated", rungs)], up_of(meta))
     yield Facts("Facts", meta)
+
+
+def up_of(meta: Mapping[str, Any]) -> tuple[float, float, float]:
+    """The axis that points up in most files of the kind: collect keeps a file's own axes."""
+    source = str(meta.get("source", ""))
+    return (0.0, 0.0, 1.0) if source == "procedural" or source.lower().endswith(Z_UP) else (0.0, 1.0, 0.0)
 
 
 def surface(name: str, vertices: np.ndarray, faces: np.ndarray, colours: dict[str, np.ndarray] | None = None) -> Surface:

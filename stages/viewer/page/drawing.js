@@ -44,8 +44,9 @@ void main() {
     }
   }
   shown = encoded(shown);
-  vec3 edge = corner / max(fwidth(corner), vec3(1e-9));
+  vec3 step = max(fwidth(corner), vec3(1e-9)), edge = corner / step;
   float line = 1.0 - smoothstep(0.4, 1.3, min(edge.x, min(edge.y, edge.z)));
+  line *= mix(1.0, 0.3, smoothstep(0.05, 0.35, max(step.x, max(step.y, step.z)))); // small triangles are not all lines
   colour = vec4(mix(shown, vec3(dot(shown, vec3(0.33)) > 0.5 ? 0.08 : 0.95), wire * line), 1.0);
 }`];
 
@@ -359,7 +360,7 @@ export class Viewport {
     }
     gl.useProgram(this.plainProgram);
     gl.uniformMatrix4fv(set(this.plainProgram, "camera"), true, camera);
-    gl.uniform1f(set(this.plainProgram, "size"), Math.max(1, 1.5 * ratio));
+    gl.uniform1f(set(this.plainProgram, "size"), Math.max(1, ratio));
     for (const [kind, how] of [["points", gl.POINTS], ["lines", gl.LINES]])
       if (this.show[kind] && this.counts[kind]) {
         gl.bindVertexArray(this.buffers[kind].vao);

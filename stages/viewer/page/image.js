@@ -178,7 +178,7 @@ export class ImageView {
     const picture = paint().draw(texture, name === "image" ? this.gains : [[1, 1, 1]], { exposure: this.exposure, mapper: this.mapper, kind });
     this.canvas.width = picture.width;
     this.canvas.height = picture.height;
-    this.canvas.getContext("2d").putImageData(picture, 0, 0);
+    this.canvas.getContext("2d", { willReadFrequently: true }).putImageData(picture, 0, 0);
     this.ondraw();
   }
 

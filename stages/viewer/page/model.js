@@ -44,7 +44,7 @@ export class Model {
     this.shows = h("div", { class: "shows", role: "radiogroup", "aria-label": "What is shown" }, SHOWS.map(([key, text], i) =>
       h("button", { type: "button", role: "radio", "aria-checked": String(key === this.space.source), "data-show": key, title: `key ${i + 1}`, disabled: key === "stored" && !this.space.eyes.some((eye) => eye.image), onclick: () => this.space.use(key) }, text)));
     const { boxes } = this.space;
-    boxes.shows.append(this.shows);
+    boxes.shows.append(this.shows, this.told);
     this.checkpoint = h("div", {});
     const lights = this.count ? lightControls(this.count, (l, gain) => { this.gains[l] = gain; this.relight(); }, (l) => this.gains[l]) : null;
     lights?.addEventListener("change", () => this.rested()); // let go
@@ -54,7 +54,8 @@ export class Model {
     this.sliders = h("div", {});
     this.editor.append(this.part, this.sliders);
     if (lights) boxes.lights.append(lights);
-    boxes.model.append(this.checkpoint, this.told, this.scores);
+    const middle = h("button", { type: "button", title: "Alt + click asks for any other pixel", onclick: () => this.look(0.5, 0.5) }, "Attention of the middle pixel");
+    boxes.model.append(this.checkpoint, h("div", { class: "buttons" }, middle), this.scores);
     boxes.objects.append(this.editor);
     this.start();
   }
@@ -203,8 +204,8 @@ export class Model {
       const now = material.diffuse ?? [0, 1, 2].map((k) => diffuse[3 * first + k]);
       const colour = h("input", { type: "color", value: hex(now.map(encode)), id: "diffuse", oninput: () => edit("diffuse", unhex(colour.value).map(decode)), onchange: done });
       this.sliders.append(h("label", { class: "choice" }, h("span", {}, "Diffuse colour"), colour),
-        slider("Specular", { value: material.specular?.[0] ?? specular[3 * first], id: "specular", on: (v) => edit("specular", [v, v, v]), done }),
-        slider("Roughness", { min: 0.01, value: material.roughness ?? this.triangles.surface.values.roughness[first], id: "roughness", on: (v) => edit("roughness", v), done }));
+        slider("Specular", { value: material.specular?.[0] ?? specular[3 * first], id: "specular", show: (v) => v.toFixed(2), on: (v) => edit("specular", [v, v, v]), done }),
+        slider("Roughness", { min: 0.01, value: material.roughness ?? this.triangles.surface.values.roughness[first], id: "roughness", show: (v) => v.toFixed(2), on: (v) => edit("roughness", v), done }));
     }
     this.sliders.append(h("button", { type: "button", onclick: () => { delete this.edits.objects[index]; delete this.edits.materials[index]; delete this.placing[index]; this.apply(); this.space.recolour(); this.choose(index); this.rested(); } }, "As stored"));
   }
@@ -296,7 +297,7 @@ export class Model {
   subtract() {
     const [a, b] = [this.predicted.canvas, this.traced.canvas];
     if (!this.predicted.image || !this.traced.image || a.width !== b.width) return;
-    const { width, height } = a, [p, q] = [a, b].map((canvas) => canvas.getContext("2d").getImageData(0, 0, width, height));
+    const { width, height } = a, [p, q] = [a, b].map((canvas) => canvas.getContext("2d", { willReadFrequently: true }).getImageData(0, 0, width, height));
     for (let i = 0; i < p.data.length; i++) p.data[i] = i % 4 === 3 ? 255 : GAIN * Math.abs(p.data[i] - q.data[i]);
     this.difference.width = width;
     this.difference.height = height;

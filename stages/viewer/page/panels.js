@@ -7,13 +7,18 @@ import { Space } from "./space.js";
 const plain = (value) => (typeof value === "number" ? number(value) : value === null ? "–" : String(value));
 const simple = (value) => value === null || typeof value !== "object" || (Array.isArray(value) && value.length <= 16 && value.every((v) => v === null || typeof v !== "object"));
 
+const many = (value) => {
+  const n = Object.keys(value).length;
+  return `${n.toLocaleString("en")} ${Array.isArray(value) ? (n === 1 ? "entry" : "entries") : n === 1 ? "value" : "values"}`;
+};
+
 // Nested JSON as lists of names and values; long ones are folded.
 const facts = (values, depth = 0) => {
   if (simple(values)) return h("span", {}, Array.isArray(values) ? values.map(link).flatMap((v, i) => (i ? [", ", v] : [v])) : link(values));
   if (!Object.keys(values).length) return h("span", { class: "soft" }, "none");
   const entries = Object.entries(values), shown = entries.slice(0, 200), rest = entries.length - shown.length;
   return h("dl", { class: "facts" }, shown.map(([name, value]) => {
-    const inner = simple(value) || !Object.keys(value).length ? facts(value) : h("details", { open: depth === 0 && Object.keys(value).length <= 8 }, h("summary", {}, Array.isArray(value) ? `${value.length} entries` : `${Object.keys(value).length} values`), lazily(() => facts(value, depth + 1)));
+    const inner = simple(value) || !Object.keys(value).length ? facts(value) : h("details", { open: depth === 0 && Object.keys(value).length <= 8 }, h("summary", {}, many(value)), lazily(() => facts(value, depth + 1)));
     return [h("dt", {}, name), h("dd", {}, inner)];
   }), rest > 0 ? [h("dt", {}, "…"), h("dd", {}, `${rest.toLocaleString("en")} more`)] : "");
 };

@@ -44,10 +44,15 @@ export const plots = (runs) => {
     rest.length ? h("details", {}, h("summary", {}, `${rest.length} more`), h("div", { class: "plots" }, rest.map(draw))) : "");
 };
 
-// The store's artifacts as a graph: a column for each stage, an arrow from each input. `here`: an artifact; only its line is drawn.
+// The store's artifacts as a graph: a column for each stage, an arrow from each input that no other input was made from. `here`: an artifact; only its line is drawn.
 export const lineage = (artifacts, systems, here) => {
   const byKey = new Map(artifacts.map((artifact) => [artifact.key, artifact]));
   const parents = (artifact) => Object.values(artifact.inputs).map((key) => byKey.get(key)).filter(Boolean);
+  const above = new Map(), ancestors = (artifact) => { // all that it was made from
+    if (!above.has(artifact)) above.set(artifact, new Set(parents(artifact).flatMap((parent) => [parent, ...ancestors(parent)])));
+    return above.get(artifact);
+  };
+  const nearest = (artifact) => parents(artifact).filter((parent) => !parents(artifact).some((other) => ancestors(other).has(parent)));
   let shown = new Set(artifacts);
   if (here) {
     shown = new Set([here]);
@@ -60,7 +65,7 @@ export const lineage = (artifacts, systems, here) => {
   const wide = 112, high = 50, gap = 26, room = 12, rows = Math.max(...columns.map((column) => column.artifacts.length), 1);
   const place = new Map(), height = rows * (high + room) + 24;
   columns.forEach((column, i) => column.artifacts.forEach((artifact, k) => place.set(artifact, [i * (wide + gap), 24 + k * (high + room)])));
-  const arrows = [...place].flatMap(([artifact, [x, y]]) => parents(artifact).filter((parent) => place.has(parent)).map((parent) => {
+  const arrows = [...place].flatMap(([artifact, [x, y]]) => nearest(artifact).filter((parent) => place.has(parent)).map((parent) => {
     const [px, py] = place.get(parent), a = [px + wide, py + high / 2], b = [x, y + high / 2], bend = Math.max(13, (b[0] - a[0]) / 2);
     return s("path", { d: `M${a} C${a[0] + bend},${a[1]} ${b[0] - bend},${b[1]} ${b}`, class: "arrow" + (here && (artifact === here || parent === here) ? " near" : "") });
   }));
