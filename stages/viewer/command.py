@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import webbrowser
 from collections.abc import Sequence
@@ -93,7 +94,9 @@ def serve(viewer: Viewer, host: str = "127.0.0.1", port: int = PORT, browser: bo
     try:
         server.serve_forever()
     except KeyboardInterrupt:
-        print("stopped")
+        print("stopped", flush=True)
+        if viewer.busy:  # a renderer cannot be interrupted, and would be waited for; nothing here is half written
+            os._exit(0)
     finally:
         server.server_close()
     return 0

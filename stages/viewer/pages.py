@@ -6,6 +6,7 @@ folder in the store, and a file of it only if the manifest lists it. So no name 
 
 from __future__ import annotations
 
+import contextlib
 import re
 import threading
 import time
@@ -33,6 +34,7 @@ class Pages:
         self.store = store
         self.systems = {system.name: system for system in sorted(systems, key=lambda system: system.name != LEGACY_SYSTEM)}
         self._kept: OrderedDict[str, tuple[Any, Artifact]] = OrderedDict()
+        self._summaries: dict[str, tuple[Any, dict[str, Any]]] = {}
         self._lock = threading.Lock()
 
     # -- finding
@@ -41,14 +43,7 @@ class Pages:
         """The artifact of that name (``stage/folder`` or ``system/stage/folder``), with its listing once it was read."""
         if not NAME.match(name):
             raise UserError(f"{name!r} is not the name of an artifact, such as render/128px-0123456789ab")
-        path = self.store.root / name
-        try:
-            stat = (path / "manifest.json").stat()
-        except OSError:
-            if path.is_dir():
-                raise Damaged(f"{name} has no manifest: `lightmill repair {name}` makes it anew") from None
-            raise UserError(f"there is no artifact {name} in {self.store.root}") from None
-        stamp = stat.st_ino, stat.st_mtime_ns, stat.st_size
+        stamp, path = self._stamp(name), self.store.root / name
         with self._lock:
             kept = self._kept.pop(name, None)
             if kept is None or kept[0] != stamp:
@@ -57,6 +52,27 @@ class Pages:
             while len(self._kept) > KEPT:
                 self._kept.popitem(last=False)
             return kept[1]
+
+    def _stamp(self, name: str) -> tuple[int, int, int]:
+        """What changes when the artifact's manifest does."""
+        path = self.store.root / name
+        try:
+            stat = (path / "manifest.json").stat()
+        except OSError:
+            if path.is_dir():
+                raise Damaged(f"{name} has no manifest: `lightmill repair {name}` makes it anew") from None
+            raise UserError(f"there is no artifact {name} in {self.store.root}") from None
+        return stat.st_ino, stat.st_mtime_ns, stat.st_size
+
+    def by_key(self, key: str) -> Artifact | None:
+        """The artifact of that key, if it is still in the store and its manifest can be read."""
+        for path in self.store.folders():
+            if path.name.endswith(f"-{key[:12]}"):
+                with contextlib.suppress(Damaged):
+                    artifact = self.artifact(path.relative_to(self.store.root).as_posix())
+                    if artifact.key == key:
+                        return artifact
+        return None
 
     def shown(self, name: str, record_id: str | None = None) -> Shown:
         artifact = self.artifact(name)
@@ -84,26 +100,37 @@ class Pages:
 
     def overview(self) -> dict[str, Any]:
         """All systems with their stages, all artifacts, what is unfinished, and what is damaged."""
-        artifacts = self.store.artifacts()
-        readable = {artifact.path for artifact in artifacts}
-        damaged = [path.relative_to(self.store.root).as_posix() for path in self.store.folders() if path not in readable]
+        summaries, damaged = [], []
+        for path in self.store.folders():
+            name = path.relative_to(self.store.root).as_posix()
+            try:
+                summaries.append(self._summary(name))
+            except Damaged:
+                damaged.append(name)
+        summaries.sort(key=lambda summary: summary["finished"])
         order = {name: list(system.modules) for name, system in self.systems.items()}
-        for artifact in artifacts:  # a system that is not the project's: stages in the order of their making
-            stages = order.setdefault(artifact.system, [])
-            if artifact.stage not in stages:
-                stages.append(artifact.stage)
-        present = {artifact.system for artifact in artifacts} | {state["place"].partition("/")[0] for state in self.states()}
+        for summary in summaries:  # a system that is not the project's: stages in the order of their making
+            stages = order.setdefault(summary["system"], [])
+            if summary["stage"] not in stages:
+                stages.append(summary["stage"])
         return {
             "store": str(self.store.root),
-            "systems": [
-                {"name": name, "stages": stages} for name, stages in order.items() if name in present or name in self.systems
-            ],
-            "artifacts": [self._summary(artifact) for artifact in artifacts],
+            "systems": [{"name": name, "stages": stages} for name, stages in order.items()],
+            "artifacts": summaries,
             "states": self.states(),
             "damaged": damaged,
         }
 
-    def _summary(self, artifact: Artifact) -> dict[str, Any]:
+    def _summary(self, name: str) -> dict[str, Any]:
+        """What a card tells of an artifact. Kept: the manifest of a large one takes long to read."""
+        stamp = self._stamp(name)
+        if self._summaries.get(name, (None,))[0] != stamp:
+            self._summaries[name] = stamp, self._facts(self.artifact(name))
+        facts = self._summaries[name][1]
+        return {**facts, "age_s": time.time() - facts["finished"], "pinned": self.store.pinned(facts["key"])}
+
+    @staticmethod
+    def _facts(artifact: Artifact) -> dict[str, Any]:
         manifest = artifact.manifest
         outputs = manifest["outputs"]
         return {
@@ -117,9 +144,7 @@ class Pages:
             "rejects": outputs["rejects"],
             "bytes": outputs["bytes"],
             "finished": manifest["finished"],
-            "age_s": time.time() - manifest["finished"],
             "inputs": manifest["preimage"]["inputs"],
-            "pinned": self.store.pinned(artifact.key),
         }
 
     def states(self) -> list[dict[str, Any]]:
@@ -131,7 +156,7 @@ class Pages:
         artifact = self.artifact(name)
         manifest = artifact.manifest
         return {
-            **self._summary(artifact),
+            **self._summary(name),
             "path": str(artifact.path),
             "reasons": self._reasons(artifact),
             "made": {
@@ -200,10 +225,9 @@ class Pages:
         out, seen, todo = [], set(), list(artifact.manifest["preimage"]["inputs"].items())
         while todo:
             role, key = todo.pop(0)
-            parent = self.store.by_key(key) if key not in seen else None
+            parent = self.by_key(key) if key not in seen else None
             seen.add(key)
             if parent is not None:
-                parent = self.artifact(parent.path.relative_to(self.store.root).as_posix())
                 if record_id in parent:
                     same = {"artifact": parent.name, "stage": parent.stage, "role": role}
                     out.append((parent.manifest["finished"], same))

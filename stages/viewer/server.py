@@ -67,6 +67,7 @@ class Viewer:
         self.pages = Pages(context.store, systems) if context.store is not None else None
         self.word = secrets.token_urlsafe(16)
         self._shown: OrderedDict[tuple[str, str | None], list[Any]] = OrderedDict()  # panels whose values may be asked for
+        self.busy = 0  # requests whose numerical work is under way
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="numerical work")
 
     def panels(self, artifact: str, record: str | None) -> list[Any]:
@@ -136,7 +137,11 @@ class Viewer:
         chosen = next((views for s in self.systems if s.name == system and (views := views_of(s)) is not None), None)
         if chosen is None or name not in chosen.actions:
             raise Refused(404, f"there is no action {name} of {system}")
-        return self._worker.submit(lambda: pack(chosen.actions[name](self.context, arguments))).result()
+        self.busy += 1
+        try:
+            return self._worker.submit(lambda: pack(chosen.actions[name](self.context, arguments))).result()
+        finally:
+            self.busy -= 1
 
 
 class Server(ThreadingHTTPServer):
@@ -320,7 +325,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Security-Policy", policy)
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Referrer-Policy", "no-referrer")
-        self.send_header("Cross-Origin-Resource-Policy", "same-origin" if self.path.startswith("/api") else "cross-origin")
+        self.send_header("Cross-Origin-Resource-Policy", "cross-origin" if self.path.startswith("/files/") else "same-origin")
         self.send_header("Cache-Control", "no-store")
 
     def _send(self, data: bytes, kind: str, policy: str = "default-src 'none'", status: int = 200) -> None:

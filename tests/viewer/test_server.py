@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import http.client
 import json
+import signal
 import socket
+import subprocess
+import sys
 import urllib.request
 from urllib.parse import quote
 
@@ -21,6 +24,7 @@ from stages.renderformer.records import SceneRecord
 from stages.renderformer.viewing import models
 from stages.viewer.command import viewer_of
 from stages.viewer.server import Server, Viewer
+from tests.conftest import ROOT
 from tests.viewer import stores
 
 
@@ -265,6 +269,20 @@ def test_a_port_in_use_is_told_in_a_line(store, capsys):
     assert f"127.0.0.1 port {port} cannot be used" in capsys.readouterr().err
 
 
+def test_ctrl_c_stops_it(store):
+    words = [sys.executable, "-m", "stages.cli", "view", str(store[0]), "--port", "0", "--no-browser"]
+    process = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        address = process.stdout.readline().split()[0]
+        with urllib.request.urlopen(f"{address}api/start") as answer:
+            assert json.loads(answer.read())["store"]
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+        assert (process.returncode, out, err) == (0, "stopped\n", "")
+    finally:
+        process.kill()
+
+
 @pytest.mark.parametrize(
     ("what", "words"),
     [("nowhere", "no artifact 'nowhere'"), ("shard/nobody", "there is no record 'nobody'"), ("README.md", "nothing to view")],
@@ -342,7 +360,8 @@ def test_edits_change_what_they_name_and_nothing_else(store):
     assert np.array_equal(edited.triangles[~first], scene.triangles[~first])
     assert (edited.diffuse[second] == [1, 0, 0]).all() and np.array_equal(edited.diffuse[~second], scene.diffuse[~second])
     assert np.allclose(edited.emission[light], scene.emission[light] * [2, 0, 1])
-    for bad in ({"objects": {"0": [[2, 0, 0, 0], *turn[1:]]}}, {"objects": {"x": turn}}, {"lights": {"0": [1, None, 1]}}):
+    scaled = [[2, 0, 0, 0], *turn[1:]]
+    for bad in ({"objects": {"0": scaled}}, {"objects": {"x": turn}}, {"lights": {"0": [1, None, 1]}}, {"materials": {"0": 1}}):
         with pytest.raises(UserError):
             models.edited(scene, bad)
 

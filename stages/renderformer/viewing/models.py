@@ -141,8 +141,8 @@ def artifact_of(store: Store | None, name: str) -> Artifact:
 
 def edited_scene(context: Context, arguments: Mapping[str, Any]) -> SceneRecord:
     """The scene of a request, edited as it says, with its camera alone."""
-    scene = edited(base_scene(context, arguments.get("scene")), arguments.get("edits") or {})
-    camera = arguments.get("camera") or {}
+    edits, camera = (mapping(arguments.get(name) or {}, name) for name in ("edits", "camera"))
+    scene = edited(base_scene(context, arguments.get("scene")), edits)
     pose = numbers(camera.get("camera_to_world"), (4, 4), "camera_to_world")
     fov = numbers(camera.get("fov_deg"), (), "fov_deg")
     if not 1 <= fov <= 170:
@@ -167,7 +167,7 @@ def edited(scene: SceneRecord, edits: Mapping[str, Any]) -> SceneRecord:
         triangles[faces] = triangles[faces] @ rotation.T + matrix[:3, 3]
         normals[faces] = normals[faces] @ rotation.T
     for number, material in rows_of(edits, "materials"):
-        faces = scene.object_index == number
+        material, faces = mapping(material, f"material {number}"), scene.object_index == number
         for name, shape, low, high in (("diffuse", (3,), 0, 1), ("specular", (3,), 0, 1), ("roughness", (), 0.01, 1)):
             if name in material:
                 changed[name][faces] = np.clip(numbers(material[name], shape, name), low, high)
@@ -180,10 +180,16 @@ def edited(scene: SceneRecord, edits: Mapping[str, Any]) -> SceneRecord:
 
 
 def rows_of(edits: Mapping[str, Any], name: str) -> Iterator[tuple[int, Any]]:
-    rows = edits.get(name) or {}
-    if not isinstance(rows, Mapping) or not all(str(number).isdecimal() for number in rows):
+    rows = mapping(edits.get(name) or {}, name)
+    if not all(str(number).isdecimal() for number in rows):
         raise UserError(f"edits of {name} are given by number")
     yield from ((int(number), value) for number, value in rows.items())
+
+
+def mapping(value: Any, name: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise UserError(f"{name}: expected an object")
+    return value
 
 
 def numbers(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -255,7 +261,8 @@ def compare(context: Context, arguments: Mapping[str, Any]) -> dict[str, str]:
 
 def without_gains(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """The request with all lights as they are stored."""
-    edits = {name: value for name, value in (arguments.get("edits") or {}).items() if name != "lights"}
+    edits = mapping(arguments.get("edits") or {}, "edits")
+    edits = {name: value for name, value in edits.items() if name != "lights"}
     return {**arguments, "edits": edits}
 
 
