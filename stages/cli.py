@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
-import pkgutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-import stages
 from model.weights import SETS
 from pipeline.commands import add_commands
 from pipeline.errors import INTERRUPTED, UserError, for_people, status_of
-from pipeline.stage import System
+from stages import systems
+from stages.viewer.command import add_command as add_view
 
 PROGRAM = "lightmill"
 ALIASES = {"fid": "inception"}  # of sets of weights
-
-
-def systems() -> Iterator[System]:
-    """The project's systems: the packages of ``stages`` that supply one."""
-    for module in pkgutil.iter_modules(stages.__path__):
-        if module.ispkg:
-            system = getattr(importlib.import_module(f"stages.{module.name}"), "SYSTEM", None)
-            if isinstance(system, System):
-                yield system
 
 
 def command_run(arguments: argparse.Namespace) -> int:
@@ -72,10 +61,11 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--archive", metavar="FILE", help="the package's archive, where there is no network for pip")
     sub.add_argument("--folder", metavar="DIR", help="where to (default: the user's cache, where all stages look)")
     add_commands(parsers, PROGRAM)
-    for system in systems():
+    known = list(systems())
+    add_view(parsers, PROGRAM, known)
+    for system in known:
         if system.commands:
-            module, _, function = system.commands.partition(":")
-            getattr(importlib.import_module(module), function)(parsers, PROGRAM)
+            system.load(system.commands)(parsers, PROGRAM)
     for sub in parsers.choices.values():
         sub.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show the traceback of an error")
     return parser

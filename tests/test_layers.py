@@ -21,12 +21,14 @@ HOUSE = ("lightmill", "stages", "model", "pipeline")
 LAYERS = """
 lightmill
 stages.cli
+stages.viewer
 stages.renderformer
 stages.renderformer.commands
 stages.renderformer.s03_variants  stages.renderformer.s06_given
 stages.renderformer.s00_collect  stages.renderformer.s01_remesh  stages.renderformer.s02_decimate  \
 stages.renderformer.s03_import  stages.renderformer.s03_scene  stages.renderformer.s04_render  \
 stages.renderformer.s05_shard  stages.renderformer.s06_train  stages.renderformer.s07_evaluate  stages.renderformer.s08_probe
+stages.renderformer.viewing
 stages.renderformer.probes
 stages.renderformer.evaluation
 stages.renderformer.inference
@@ -35,7 +37,7 @@ stages.renderformer.rendering
 stages.renderformer.dataset  stages.renderformer.scenes  stages.renderformer.objects
 stages.renderformer.views  stages.renderformer.hub
 stages.renderformer.records
-stages.neuras.commands
+stages.neuras.commands  stages.neuras.viewing
 stages.neuras.s02_atlas  stages.neuras.s03_fit  stages.neuras.s04_bake  stages.neuras.s05_evaluate
 stages.neuras.s00_capture  stages.neuras.s01_scaffold
 stages.neuras.evaluation
@@ -50,9 +52,9 @@ stages.graphics.geometry.formats
 stages.graphics.geometry.colours  stages.graphics.geometry.measure
 stages.graphics.geometry.records  stages.graphics.geometry.paths
 stages.graphics.geometry  stages.graphics.mitsuba  stages.graphics.statistics  stages.graphics.video  \
-stages.graphics.device  stages.graphics.denoising
+stages.graphics.device  stages.graphics.denoising  stages.graphics.panels
 stages.graphics.metrics  stages.graphics.exr
-stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages.graphics.page
+stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages.graphics.page  stages.graphics.browser
 stages.graphics
 model.renderformer  model.neuras
 model.training

@@ -100,12 +100,17 @@ def min_angle_deg(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def crossing(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Share of the faces that pass through another one."""
+    return round(int(crossing_faces(vertices, faces).sum()) / len(faces), 4)
+
+
+def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) bool: faces that pass through another one."""
     import pymeshlab
 
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32)))
     meshes.compute_selection_by_self_intersections_per_face()
-    return round(meshes.current_mesh().selected_face_number() / len(faces), 4)
+    return np.asarray(meshes.current_mesh().face_selection_array(), bool)
 
 
 def content_hash(vertices: np.ndarray, faces: np.ndarray) -> str:
