@@ -45,7 +45,7 @@ stages.neuras
 stages
 stages.graphics.geometry  stages.graphics.mitsuba  stages.graphics.statistics  stages.graphics.video  \
 stages.graphics.device  stages.graphics.denoising
-stages.graphics.metrics  stages.graphics.exr
+stages.graphics.metrics  stages.graphics.exr  stages.graphics.casting
 stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages.graphics.page
 stages.graphics
 model.renderformer  model.neuras
