@@ -1,4 +1,4 @@
-"""Released-format checkpoint folders: ``config.json`` and ``model.safetensors``, read and written strictly.
+"""Checkpoint folders: ``config.json`` and ``model.safetensors``, read and written strictly; RenderFormer's are released ones.
 
 What a model was trained with travels in the safetensors header's metadata, which other readers ignore.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -15,16 +16,14 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from model.errors import InputError
-from model.renderformer.config import ModelConfig
-from model.renderformer.network import RenderFormer
+from model.renderformer.architectures import build, load_config
+from model.renderformer.base import Network
 from pipeline.atomic import atomic_path, write_atomic
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 
 
-def save(
-    config: ModelConfig, weights: Mapping[str, Tensor], folder: Path, trained_with: Mapping[str, str] | None = None
-) -> None:
+def save(config: Any, weights: Mapping[str, Tensor], folder: Path, trained_with: Mapping[str, str] | None = None) -> None:
     """Write the folder from a network's config and state dict; each file appears whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
@@ -48,13 +47,12 @@ def _sort_metadata(path: Path) -> None:
         file.write(data)
 
 
-def _check_shapes(config: ModelConfig, stored: Mapping[str, tuple[int, ...]], path: Path) -> None:
+def _check_shapes(config: Any, stored: Mapping[str, tuple[int, ...]], path: Path) -> None:
     """That the file holds the network which the config asks for, before a byte of either is allocated."""
-    layers = config.num_layers + config.view_transformer_n_layers
-    if layers > len(stored):
-        raise InputError(f"{path} holds {len(stored)} tensors, {CONFIG} asks for {layers} layers")
+    if config.depth > len(stored):
+        raise InputError(f"{path} holds {len(stored)} tensors, {CONFIG} asks for {config.depth} layers")
     with torch.device("meta"):
-        expected = {name: tuple(tensor.shape) for name, tensor in RenderFormer(config).state_dict().items()}
+        expected = {name: tuple(tensor.shape) for name, tensor in build(config).state_dict().items()}
     for kind, differing in (("unknown", stored.keys() - expected.keys()), ("missing", expected.keys() - stored.keys())):
         if differing:
             raise InputError(f"{path}: {kind} parameter {', '.join(sorted(differing))} for the network of {CONFIG}")
@@ -63,10 +61,10 @@ def _check_shapes(config: ModelConfig, stored: Mapping[str, tuple[int, ...]], pa
             raise InputError(f"{path}: {name} has shape {shape}, {CONFIG} asks for {expected[name]}")
 
 
-def load(folder: Path) -> tuple[RenderFormer, dict[str, str]]:
+def load(folder: Path) -> tuple[Network, dict[str, str]]:
     """The model, on the CPU in float32 and in eval mode, and what it says it was trained with (may be empty)."""
     folder = Path(folder)
-    config = ModelConfig.load(folder / CONFIG)
+    config = load_config(folder / CONFIG)
     path = folder / WEIGHTS
     if not path.is_file():
         raise InputError(f"{path} is missing: a checkpoint folder holds {CONFIG} and {WEIGHTS}")
@@ -77,6 +75,6 @@ def load(folder: Path) -> tuple[RenderFormer, dict[str, str]]:
             state = {name: file.get_tensor(name) for name in sorted(file.keys())}
     except SafetensorError as error:
         raise InputError(f"{path} is not a safetensors file: {error}") from None
-    model = RenderFormer(config)
+    model = build(config)
     model.load_state_dict(state)
     return model.eval(), {name: value for name, value in metadata.items() if name != "format"}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,6 +70,18 @@ class ViewGuides:
         return ViewGuides(**{name: np.ascontiguousarray(values) for name, values in flipped.items()})
 
 
+def check_guides(triangles: int, scene: SceneGuides, views: Iterable[ViewGuides]) -> None:
+    """UserError unless the guides can be those of a scene of so many triangles."""
+    lights = scene.light_triangles
+    fits = scene.light_seen.shape == (triangles, SUBSAMPLES, len(lights))
+    fits = fits and (not len(lights) or 0 <= lights.min() <= lights.max() < triangles)
+    for view in views:
+        fits = fits and view.light_seen.shape[-1] == len(lights)
+        fits = fits and all(kind.max(initial=-1) < triangles for kind in (view.hit, view.mirror, view.lobe))
+    if not fits:
+        raise UserError(f"the guides are not those of a scene of {triangles} triangles: make the shards again")
+
+
 def mirrored_seen(light_seen: np.ndarray) -> np.ndarray:
     """(N, 4, L) of `SceneGuides` in the mirrored scene."""
     return light_seen[:, [0, 2, 1, 3]]
@@ -79,9 +91,7 @@ def mirrored_seen(light_seen: np.ndarray) -> np.ndarray:
 
 
 def encode_scene_guides(guides: SceneGuides) -> bytes:
-    return _pack(
-        {"light_triangles": guides.light_triangles.astype(np.int32), "light_seen": _bits(guides.light_seen)}
-    )
+    return _pack({"light_triangles": guides.light_triangles.astype(np.int32), "light_seen": _bits(guides.light_seen)})
 
 
 def decode_scene_guides(data: bytes, where: str) -> SceneGuides:
@@ -132,5 +142,3 @@ def _unpack(data: bytes, where: str, names: tuple[str, ...]) -> dict[str, Any]:
             return {name: file[name] for name in names}
     except (KeyError, ValueError, OSError, EOFError, MemoryError, zipfile.BadZipFile, zipfile.zlib.error) as error:
         raise UserError(f"{where} cannot be decoded ({type(error).__name__}: {error})") from error
-
-
