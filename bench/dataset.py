@@ -22,7 +22,7 @@ import numpy as np
 from pipeline.store import Artifact, Store, iter_inputs
 from stages.graphics import exr
 from stages.graphics.exr import decode_lights
-from stages.renderformer.dataset import BatchConfig, Batches, Relight, ShardDataset, prefetch
+from stages.renderformer.dataset import BatchConfig, Batches, Needs, Relight, ShardDataset, prefetch
 from stages.renderformer.dataset.encoding import decode_scene
 from stages.renderformer.dataset.interchange import write_hdf5
 from stages.renderformer.dataset.shards import Reader

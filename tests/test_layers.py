@@ -32,7 +32,7 @@ stages.renderformer.evaluation
 stages.renderformer.inference
 stages.renderformer.rendering
 stages.renderformer.dataset  stages.renderformer.scenes  stages.renderformer.objects
-stages.renderformer.views
+stages.renderformer.views  stages.renderformer.guides
 stages.renderformer.records
 stages.neuras.commands
 stages.neuras.s02_atlas  stages.neuras.s03_fit  stages.neuras.s04_bake  stages.neuras.s05_evaluate
@@ -48,7 +48,14 @@ stages.graphics.device  stages.graphics.denoising
 stages.graphics.metrics  stages.graphics.exr  stages.graphics.casting
 stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages.graphics.page
 stages.graphics
-model.renderformer  model.neuras
+model.renderformer.training  model.neuras
+model.renderformer.checkpoint
+model.renderformer.architectures  model.renderformer.reference  model.renderformer.initial  model.renderformer.timing
+model.renderformer.guided
+model.renderformer.network
+model.renderformer.flops  model.renderformer.dpt  model.renderformer.inputs  model.renderformer.losses
+model.renderformer.layers  model.renderformer.base  model.renderformer.config  model.renderformer.recipe
+model.renderformer
 model.training
 model.lpips  model.inception  model.timing
 model.weights

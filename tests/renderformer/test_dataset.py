@@ -18,6 +18,7 @@ from stages.renderformer.dataset import (
     Batches,
     DamagedSample,
     DamagedShard,
+    Needs,
     Relight,
     ShardDataset,
     collate,

@@ -10,6 +10,12 @@ from typing import Any, Literal
 from model.errors import InputError
 
 ARCHITECTURE = "guided"
+# Channels that networks of any config have
+TOKEN_FEATURES = 82  # what is known of a triangle
+PIXEL_FEATURES = 88  # of a pixel
+LIGHT_FEATURES = 13  # of a light in a pixel
+PIXEL_DIM = 32  # of a pixel in its bundle
+LIGHT_DIM = 32  # of a pixel's light, and of a corner's token
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from model.renderformer.guided.config import GuidedConfig
-from model.renderformer.guided.network import LIGHT_DIM, LIGHT_FEATURES, PIXEL_DIM, PIXEL_FEATURES, TOKEN_FEATURES
+from model.renderformer.guided.config import (
+    LIGHT_DIM,
+    LIGHT_FEATURES,
+    PIXEL_DIM,
+    PIXEL_FEATURES,
+    TOKEN_FEATURES,
+    GuidedConfig,
+)
 
 LIGHTS = 4.5  # of a scene, where nobody says: the mean of the training data
 

@@ -19,15 +19,21 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model.renderformer.base import Network, autocast, run_layer
-from model.renderformer.guided.config import GuidedConfig
+from model.renderformer.guided.config import (
+    LIGHT_DIM,
+    LIGHT_FEATURES,
+    PIXEL_DIM,
+    PIXEL_FEATURES,
+    TOKEN_FEATURES,
+    GuidedConfig,
+)
+from model.renderformer.guided.flops import forward_flops
 from model.renderformer.guided.inputs import POINTS, SUBSAMPLES, Hits, Scenes, Surface
 from model.renderformer.guided.light import diffuse_light, joint_masking, masking, specular_light, vector_form_factor
 from model.renderformer.layers import LAYER_EPS, DecoderLayer, EncoderLayer, FeedForward, RMSNorm, Rotation
 
 FREQUENCIES = 4  # of an encoded position: pi, 2 pi, 4 pi, 8 pi
 SOFT = 0.02  # visibility is corrected as if it were this far from 0 and 1
-LIGHT_DIM = 32  # width of what corrects a light's visibility in a pixel
-PIXEL_DIM = 32  # of a pixel in its bundle
 AT_ONCE = 300_000  # pairs of ray and light that are computed together where no gradient is kept
 
 
@@ -35,13 +41,15 @@ AT_ONCE = 300_000  # pairs of ray and light that are computed together where no 
 class Pixels:
     """Some pixels of the views of B scenes, by ray bundles: B x (V K) bundles of P^2 pixels of 4 rays.
 
-    eye: (B, V, 3). hit, mirror, lobe: rays (B, V K P^2 4), (B, V K P^2), (B, V K P^2 4). seen: (B, V K P^2 4, L) or None.
+    eye: (B, V, 3). hit, mirror, lobe: rays (B, V K P^2 4), (B, V K P^2), (B, V K P^2 4). main: (B, V K P^2), the ray of each
+    pixel that its mirror reflection starts from. seen: (B, V K P^2 4, L).
     """
 
     eye: Tensor
     hit: Hits
     mirror: Hits
     lobe: Hits
+    main: Tensor
     seen: Tensor
     bundles: int  # of a view
     bundle: int
@@ -55,7 +63,8 @@ class Pixels:
         hits = {name: Hits.read(arrays[name], arrays[f"{name}_weights"], scenes) for name in ("hit", "mirror", "lobe")}
         seen = torch.from_numpy(np.ascontiguousarray(arrays["light_seen"])).to(device).float()
         eye = torch.from_numpy(np.ascontiguousarray(batch["camera_to_world"][:, :, :3, 3])).to(device).float()
-        return cls(eye, **hits, seen=seen.flatten(1, -2), bundles=arrays["hit"].shape[2], bundle=bundle)
+        main = torch.from_numpy(np.ascontiguousarray(arrays["main"])).to(device).long().clamp(min=0).flatten(1)
+        return cls(eye, **hits, main=main, seen=seen.flatten(1, -2), bundles=arrays["hit"].shape[2], bundle=bundle)
 
     def split(self, most: int) -> Iterator[Pixels]:
         """The pixels in portions of at most ``most`` bundles of one view each; for one scene."""
@@ -72,11 +81,13 @@ class Pixels:
                     name: Hits(**{part: portion(value, view, first, last) for part, value in vars(getattr(self, name)).items()})
                     for name in ("hit", "mirror", "lobe")
                 }
-                seen = portion(self.seen, view, first, last)
-                yield Pixels(self.eye[:, view : view + 1], **hits, seen=seen, bundles=last - first, bundle=self.bundle)
+                main, seen = (portion(values, view, first, last) for values in (self.main, self.seen))
+                yield Pixels(
+                    self.eye[:, view : view + 1], **hits, main=main, seen=seen, bundles=last - first, bundle=self.bundle
+                )
 
 
-GUIDES = ("hit", "hit_weights", "mirror", "mirror_weights", "lobe", "lobe_weights", "light_seen")
+GUIDES = ("hit", "hit_weights", "main", "mirror", "mirror_weights", "lobe", "lobe_weights", "light_seen")
 
 
 def to_bundles(pixels: np.ndarray, side: int) -> np.ndarray:
@@ -174,11 +185,6 @@ class HeadLayer(nn.Module):
         return x + self.ffn(self.norm(x))
 
 
-LIGHT_FEATURES = 13  # of a light in a pixel: see `GuidedNetwork._light_features`
-TOKEN_FEATURES = 82
-PIXEL_FEATURES = 88
-
-
 class GuidedNetwork(Network):
     """The whole network. ``encode`` once per scene, ``decode`` its pixels; `forward` does both, for training."""
 
@@ -246,8 +252,6 @@ class GuidedNetwork(Network):
         return [*(layer for tower in towers for layer in tower), *self.head.layers]
 
     def flops(self, batch: Mapping[str, Any]) -> dict[str, float]:
-        from model.renderformer.guided.flops import forward_flops
-
         views, height, width = batch["image"].shape[1:4]
         lights = batch["guide_light_triangles"].shape[1]
         return forward_flops(self.config, batch["mask"].sum(axis=1).tolist(), views, height, width, lights=lights)
@@ -376,7 +380,7 @@ class GuidedNetwork(Network):
         else:
             seen = torch.ones_like(diffuse)
         reflected, weight = self._reflected(encoded, rays, pixels.lobe)
-        main, surface = _first(pixels.hit, rays)
+        main, surface = _main(pixels, rays)
         mirror, mirror_weight = self._reflected(encoded, surface, pixels.mirror)
         second = Surface.at(pixels.mirror, scenes, surface.position)
         highlight = self._highlight(encoded, second, pixels.mirror)
@@ -512,7 +516,7 @@ class Known:
 
     features: (B, M, PIXEL_FEATURES). lights: (B, M, L, LIGHT_FEATURES). rays: what the rays hit.
     seen, diffuse, specular: (B, M 4, L), visibility and closed forms. reflected: (B, M 4, 3), radiance in reflections.
-    position: (B, M, 3) and coverage (B, M, 1), of the pixel. main: of each pixel the first of its rays that hits anything.
+    position: (B, M, 3) and coverage (B, M, 1), of the pixel. main: the main ray of each pixel.
     """
 
     features: Tensor
@@ -543,16 +547,13 @@ def _deviation(values: Tensor, coverage: Tensor) -> Tensor:
     return (grid.amax(dim=2) - grid.amin(dim=2)) * (coverage > 0)
 
 
-def _first(hits: Hits, rays: Surface) -> tuple[Hits, Surface]:
-    """Of each pixel the first of its rays that hits anything, as hits and as surface."""
-    first = hits.there.unflatten(1, (-1, SUBSAMPLES)).argmax(dim=2)[..., 0]  # (B, M)
+def _main(pixels: Pixels, rays: Surface) -> tuple[Hits, Surface]:
+    """Of each pixel its main ray, as hits and as surface."""
 
     def choose(values: Tensor) -> Tensor:
         grid = values.unflatten(1, (-1, SUBSAMPLES))
-        index = first.reshape(*first.shape, 1, *[1] * (grid.ndim - 3)).expand(*first.shape, 1, *grid.shape[3:])
-        return grid.gather(2, index).squeeze(2)
+        index = pixels.main.reshape(*pixels.main.shape, 1, *[1] * (grid.ndim - 3))
+        return grid.gather(2, index.expand(-1, -1, 1, *grid.shape[3:])).squeeze(2)
 
-    return (
-        Hits(**{name: choose(values) for name, values in vars(hits).items()}),
-        Surface(**{name: choose(values) for name, values in vars(rays).items()}),
-    )
+    hits = Hits(**{name: choose(values) for name, values in vars(pixels.hit).items()})
+    return hits, Surface(**{name: choose(values) for name, values in vars(rays).items()})

@@ -75,10 +75,11 @@ class GuideCaster:
         numbers = ((strata + random) / 2).reshape(-1, 2)[there]
         lobe[there], lobe_weights[there] = self._reflect(surface, sample_ggx(surface.to_eye, surface.alpha, numbers))
 
-        first = np.where((hit >= 0).reshape(-1, SUBSAMPLES).any(axis=1), (hit >= 0).reshape(-1, SUBSAMPLES).argmax(axis=1), -1)
-        pixels = np.flatnonzero(first >= 0)
-        chosen = np.searchsorted(there, pixels * SUBSAMPLES + first[pixels])
-        mirror, mirror_weights = np.full(len(first), -1, np.int32), np.zeros((len(first), 2), np.float32)
+        landed = (hit >= 0).reshape(-1, SUBSAMPLES)
+        main = np.where(landed.any(axis=1), landed.argmax(axis=1), -1).astype(np.int32)
+        pixels = np.flatnonzero(main >= 0)
+        chosen = np.searchsorted(there, pixels * SUBSAMPLES + main[pixels])
+        mirror, mirror_weights = np.full(len(main), -1, np.int32), np.zeros((len(main), 2), np.float32)
         straight = surface.take(chosen)
         up = np.broadcast_to([0.0, 0.0, 1.0], straight.to_eye.shape)
         mirror[pixels], mirror_weights[pixels] = self._reflect(straight, up)
@@ -91,6 +92,7 @@ class GuideCaster:
         return ViewGuides(
             hit.reshape(shape),
             weights.reshape(*shape, 2),
+            main.reshape(height, width),
             mirror.reshape(height, width),
             mirror_weights.reshape(height, width, 2),
             lobe.reshape(shape),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -47,13 +47,15 @@ class ViewGuides:
     are float32, of the second and the third corner.
 
     hit: (H, W, 4), what the pixel's 2 x 2 rays hit; lights are invisible to them. hit_weights: (H, W, 4, 2).
-    mirror: (H, W), what the reflection of the first of these rays that hits anything hits. mirror_weights: (H, W, 2).
+    main: (H, W) int32, one of these rays that hits something, -1 where none does; of these the first, row by row.
+    mirror: (H, W), what the mirror reflection of that ray hits. mirror_weights: (H, W, 2).
     lobe: (H, W, 4), what a reflection of each ray hits that is drawn from the surface's GGX lobe. lobe_weights: (H, W, 4, 2).
     light_seen: (H, W, 4, L) bool, whether the hit point sees a point of the light; False where the light is behind it.
     """
 
     hit: np.ndarray
     hit_weights: np.ndarray
+    main: np.ndarray
     mirror: np.ndarray
     mirror_weights: np.ndarray
     lobe: np.ndarray
@@ -67,6 +69,7 @@ class ViewGuides:
             flipped[name] = flipped[name][:, :, list(MIRRORED)]
         for name in ("hit_weights", "mirror_weights", "lobe_weights"):
             flipped[name] = flipped[name][..., ::-1]
+        flipped["main"] = np.where(flipped["main"] < 0, -1, np.array(MIRRORED, np.int32)[flipped["main"]])
         return ViewGuides(**{name: np.ascontiguousarray(values) for name, values in flipped.items()})
 
 
@@ -76,7 +79,7 @@ def check_guides(triangles: int, scene: SceneGuides, views: Iterable[ViewGuides]
     fits = scene.light_seen.shape == (triangles, SUBSAMPLES, len(lights))
     fits = fits and (not len(lights) or 0 <= lights.min() <= lights.max() < triangles)
     for view in views:
-        fits = fits and view.light_seen.shape[-1] == len(lights)
+        fits = fits and view.light_seen.shape[-1] == len(lights) and view.main.max(initial=-1) < SUBSAMPLES
         fits = fits and all(kind.max(initial=-1) < triangles for kind in (view.hit, view.mirror, view.lobe))
     if not fits:
         raise UserError(f"the guides are not those of a scene of {triangles} triangles: make the shards again")
@@ -102,6 +105,7 @@ def decode_scene_guides(data: bytes, where: str) -> SceneGuides:
 
 def encode_view_guides(guides: ViewGuides) -> bytes:
     arrays = {"light_seen": _bits(guides.light_seen), "lights": np.int32(guides.light_seen.shape[-1])}
+    arrays["main"] = guides.main.astype(np.int8)
     kind = np.uint16 if max(guides.hit.max(), guides.mirror.max(), guides.lobe.max()) < 65535 else np.uint32
     for name in ("hit", "mirror", "lobe"):
         arrays[name] = (getattr(guides, name) + 1).astype(kind)
@@ -110,8 +114,8 @@ def encode_view_guides(guides: ViewGuides) -> bytes:
 
 
 def decode_view_guides(data: bytes, where: str) -> ViewGuides:
-    names = ("hit", "hit_weights", "mirror", "mirror_weights", "lobe", "lobe_weights", "light_seen", "lights")
-    arrays = _unpack(data, where, names)
+    arrays = _unpack(data, where, (*(field.name for field in fields(ViewGuides)), "lights"))
+    arrays["main"] = arrays["main"].astype(np.int32)
     arrays["light_seen"] = _from_bits(arrays["light_seen"], int(arrays.pop("lights")), where)
     for name in ("hit", "mirror", "lobe"):
         arrays[name] = arrays[name].astype(np.int32) - 1
