@@ -44,6 +44,10 @@ class Network(nn.Module, ABC):
     def tokens(self, batch: Arrays) -> int:
         """Triangles, registers and ray bundles of the batch."""
 
+    def without_learning(self) -> Network | None:
+        """This network as it was before training, where its image is more than noise then."""
+        return None
+
     def leak_gradient(self, share: float) -> None:
         """Pass this share of the gradient to outputs that are negative, besides what the network passes itself."""
 

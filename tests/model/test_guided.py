@@ -175,34 +175,42 @@ RUNGS = {
 
 @pytest.mark.parametrize("rung", RUNGS)
 def test_before_training_the_image_is_the_closed_form(rung):
-    data = guided_batch()
-    model = network(trained=False, guide=RUNGS[rung])
+    """The sum over lights and rays, written out; and a trained network without what it learned is that again."""
+    data, guide = guided_batch(), RUNGS[rung]
+    model = network(trained=False, guide=guide)
     scenes, pixels, _ = model.arguments(data, "cpu")
     with torch.inference_mode():
-        expected = model.closed_form(scenes, pixels)
-        y = model(scenes, pixels)
-    torch.testing.assert_close(to_radiance(y).flatten(1, 3), expected, rtol=1e-5, atol=1e-6 * float(expected.max()))
+        known = model._known(model.encode(scenes), pixels)
+    rays, expected = known.rays, torch.zeros_like(known.rays.position)
+    if guide.light:
+        for light in range(2):
+            radiance = scenes.radiance[:, None, light] * known.seen[..., light, None]
+            expected += rays.diffuse * known.diffuse[..., light, None] * radiance
+            expected += rays.specular * known.specular[..., light, None] * radiance
+    if guide.mirror or guide.lobe:
+        expected += rays.specular * known.reflected
+    expected = (expected * rays.there).unflatten(1, (-1, 4)).mean(dim=2) * scenes.scale[:, None, None]
+    size = (2, VIEWS, 2, 2, 8, 8, 3)  # bundles of 8 x 8 pixels
+    expected = expected.view(size).transpose(3, 4).reshape(2, VIEWS, SIDE, SIDE, 3)
+    torch.testing.assert_close(image(model, data), expected, rtol=1e-5, atol=1e-6 * float(expected.max()))
     assert (expected.max() > 0) == (rung != "hits alone")
-
-
-def closed_form(data: dict[str, Any]) -> torch.Tensor:
-    model = network(trained=False)
-    scenes, pixels, _ = model.arguments(data, "cpu")
-    return model.closed_form(scenes, pixels)
+    trained = network(guide=guide)
+    assert not torch.allclose(image(trained, data), expected, rtol=0.01)
+    torch.testing.assert_close(image(trained.without_learning(), data), image(model, data))
 
 
 def test_the_closed_form_is_linear_in_light():
     """Relighting by any colours is a sum of what each light sheds alone."""
-    data = guided_batch()
+    data, model = guided_batch(), network(trained=False)
     factors = np.array([[0.3, 1.7, 0.0], [2.0, 0.1, 0.5]], np.float32)
     parts = []
     for light, factor in enumerate(factors):
         alone = data["emission"].copy()
         alone[:, 1 - light] = 0
-        parts.append(closed_form({**data, "emission": alone}) * torch.from_numpy(factor))
+        parts.append(image(model, {**data, "emission": alone}) * torch.from_numpy(factor))
     relit = data["emission"].copy()
     relit[:, :2] *= factors
-    torch.testing.assert_close(sum(parts), closed_form({**data, "emission": relit}), rtol=2e-5, atol=1e-5)
+    torch.testing.assert_close(sum(parts), image(model, {**data, "emission": relit}), rtol=2e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("tokens", ["none", "lookup", "encoder"])
@@ -355,7 +363,9 @@ def test_training_learns_and_goes_on_after_a_kill(tmp_path):
             model = build(GuidedConfig(**SMALL))
             config = FitConfig(steps=12, lr=3e-3, warmup=1, log_every=4, checkpoint_every=1, validate_every=12)
             stream = lambda start, end: batches(start, min(end, stop))  # noqa: E731
-            fit(model, config, stream, [next(iter(batches(0, 1)))], folder, Group(torch.device("cpu")), say=lambda text: None)
+            validation = [next(iter(batches(0, 1)))]
+            group = Group(torch.device("cpu"))
+            fit(model, config, stream, validation, folder, group, say=lambda text: None)
         return dict(model.state_dict())
 
     whole, cut = train([12], tmp_path / "whole"), train([5, 12], tmp_path / "cut")

@@ -8,6 +8,7 @@ Tokens of triangles carry the indirect light; ray bundles gather from them at th
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -161,6 +162,10 @@ class Head(nn.Module):
         self.of_light = nn.Linear(LIGHT_FEATURES, LIGHT_DIM)
         self.light_hidden = nn.Linear(LIGHT_DIM, LIGHT_DIM)
         self.light_output = nn.Linear(LIGHT_DIM, 2)
+        self.start_at_zero()
+
+    def start_at_zero(self) -> None:
+        """Let the network say nothing: the image is the closed form."""
         for last in (self.output, self.light_output):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
@@ -251,6 +256,12 @@ class GuidedNetwork(Network):
         towers = [getattr(self, name)["layers"] for name in ("encoder", "gather") if hasattr(self, name)]
         return [*(layer for tower in towers for layer in tower), *self.head.layers]
 
+    def without_learning(self) -> GuidedNetwork:
+        """The closed form alone."""
+        network = copy.deepcopy(self)
+        network.head.start_at_zero()
+        return network
+
     def flops(self, batch: Mapping[str, Any]) -> dict[str, float]:
         views, height, width = batch["image"].shape[1:4]
         lights = batch["guide_light_triangles"].shape[1]
@@ -337,13 +348,6 @@ class GuidedNetwork(Network):
             features.append(self._gather(encoded, pixels, known))
         outputs, corrections = self.head(torch.cat(features, dim=-1), known.lights)
         return self._compose(encoded.scenes, known, outputs.float(), corrections.float())
-
-    def closed_form(self, scenes: Scenes, pixels: Pixels) -> Tensor:
-        """(B, V K P^2, 3) radiance: what the network starts from."""
-        encoded = Encoded(scenes, self._light_triangles(scenes), None, scenes.corners.mean(dim=1))
-        known = self._known(encoded, pixels)
-        none = known.lights.new_zeros(())
-        return self._compose(scenes, known, none.expand(*known.features.shape[:2], 7), none.expand(*known.lights.shape[:3], 2))
 
     def _gather(self, encoded: Encoded, pixels: Pixels, known: Known) -> Tensor:
         """(B, M, d): what each pixel's bundle gathers from the tokens, by attention at the mean position that it hits."""
