@@ -146,6 +146,11 @@ class ModelConfig:
         return self.num_layers + self.view_transformer_n_layers
 
     @property
+    def description(self) -> str:
+        """The network's size in words."""
+        return f"{self.num_layers} + {self.view_transformer_n_layers} layers, width {self.latent_dim}"
+
+    @property
     def bundle_side(self) -> int:
         """Pixels along the side of a ray bundle."""
         return self.patch_size

@@ -118,12 +118,10 @@ class RunProbe(MapStage):
 
 def model_facts(worker: Worker) -> dict[str, Any]:
     """What is said of the network."""
-    config = worker.model.config
     return {
         "key": worker.inputs["train"].key,
         "parameters": sum(parameter.numel() for parameter in worker.model.parameters()),
-        "layers": f"{config.num_layers} + {config.view_transformer_n_layers}",
-        "width": config.latent_dim,
+        "network": worker.model.config.description,
         "trained_with": worker.trained_with,
     }
 

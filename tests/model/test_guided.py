@@ -362,7 +362,7 @@ def test_training_learns_and_goes_on_after_a_kill(tmp_path):
             torch.manual_seed(1)
             model = build(GuidedConfig(**SMALL))
             config = FitConfig(steps=12, lr=3e-3, warmup=1, log_every=4, checkpoint_every=1, validate_every=12)
-            stream = lambda start, end: batches(start, min(end, stop))  # noqa: E731
+            stream = lambda start, end, stop=stop: batches(start, min(end, stop))  # noqa: E731
             validation = [next(iter(batches(0, 1)))]
             group = Group(torch.device("cpu"))
             fit(model, config, stream, validation, folder, group, say=lambda text: None)

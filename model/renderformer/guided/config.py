@@ -67,6 +67,15 @@ class GuidedConfig:
         return self.head_layers + (self.token_layers if self.tokens == "encoder" else 0)
 
     @property
+    def description(self) -> str:
+        """The network's size and guides in words."""
+        guides = [name.replace("_", " ") for name, on in dataclasses.asdict(self.guide).items() if on]
+        tokens = {"none": "no tokens", "lookup": f"tokens of {self.token_dim}"}.get(
+            self.tokens, f"{self.token_layers} layers of {self.token_dim} on tokens"
+        )
+        return f"guided by {', '.join(['hits', *guides])}; {tokens}, {self.head_layers} of {self.head_dim} on pixels"
+
+    @property
     def bundle_side(self) -> int:
         """Pixels along the side of a ray bundle."""
         return self.bundle

@@ -6,7 +6,7 @@ once, and its views are decoded from the same tokens a few at a time (section 3.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,26 +35,37 @@ def predict_frames(
     """(H, W, 3) float32 linear radiance, at least 0, of each of the scene's cameras ``views``, in order."""
     from model.renderformer.network import to_radiance
 
-    arrays = scene.arrays()
-    patches = arrays.pop("patches", None)
-    batch = {name: array[None] for name, array in arrays.items()} | {"mask": np.ones((1, len(scene.triangles)), bool)}
-    if patches is not None:
-        batch["patches"] = patches
+    batch = padded_arrays(scene)
     size = (resolution, resolution) if isinstance(resolution, int) else resolution
-    caster = None
-    if model.reads_guides:
-        caster = GuideCaster(scene)
-        batch |= {name: array[None] for name, array in scene_arrays(caster.scene_guides()).items()}
+    caster = GuideCaster(scene) if model.reads_guides else None
+    if caster is not None:
+        batch |= batched(scene_arrays(caster.scene_guides()))
 
     def seen_by(view: int) -> dict[str, np.ndarray]:
-        """What a batch of this one view has besides the scene."""
-        camera = {name: getattr(scene, name)[None, [view]].astype(np.float32) for name in ("camera_to_world", "fov_deg")}
-        if caster is None:
-            return camera
-        return camera | {name: array[None] for name, array in view_arrays([caster.view_guides(view, *size)]).items()}
+        guides = {} if caster is None else batched(view_arrays([caster.view_guides(view, *size)]))
+        return camera_arrays(scene, view) | guides
 
     for y in model.to(device).eval().frames(batch, map(seen_by, views), size, device):
         yield to_radiance(y).clamp(min=0).cpu().numpy()  # the network may undershoot 0 by a thousandth
+
+
+def batched(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """As a batch of one holds them."""
+    return {name: array[None] for name, array in arrays.items()}
+
+
+def padded_arrays(scene: SceneRecord) -> dict[str, np.ndarray]:
+    """The scene as a batch of one holds it, without cameras and images."""
+    arrays = scene.arrays()
+    patches = {"patches": arrays.pop("patches")} if "patches" in arrays else {}
+    cameras = ("camera_to_world", "fov_deg")
+    triangles = {name: array for name, array in arrays.items() if name not in cameras}
+    return batched(triangles) | {"mask": np.ones((1, len(scene.triangles)), bool)} | patches
+
+
+def camera_arrays(scene: SceneRecord, view: int) -> dict[str, np.ndarray]:
+    """One of its cameras, as the same batch holds it."""
+    return {name: getattr(scene, name)[None, [view]].astype(np.float32) for name in ("camera_to_world", "fov_deg")}
 
 
 def predict_scene(model: Network, scene: SceneRecord, views: Sequence[int], resolution: int, device: Any = "cpu") -> np.ndarray:
