@@ -146,6 +146,11 @@ class ModelConfig:
         return self.num_layers + self.view_transformer_n_layers
 
     @property
+    def facts(self) -> dict[str, Any]:
+        """What probes say of the network."""
+        return {"layers": f"{self.num_layers} + {self.view_transformer_n_layers}", "width": self.latent_dim}
+
+    @property
     def description(self) -> str:
         """The network's size in words."""
         return f"{self.num_layers} + {self.view_transformer_n_layers} layers, width {self.latent_dim}"

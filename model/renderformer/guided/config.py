@@ -67,6 +67,11 @@ class GuidedConfig:
         return self.head_layers + (self.token_layers if self.tokens == "encoder" else 0)
 
     @property
+    def facts(self) -> dict[str, Any]:
+        """What probes say of the network."""
+        return {"network": self.description}
+
+    @property
     def description(self) -> str:
         """The network's size and guides in words."""
         guides = [name.replace("_", " ") for name, on in dataclasses.asdict(self.guide).items() if on]
