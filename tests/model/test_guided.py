@@ -15,8 +15,9 @@ from model.renderformer import checkpoint
 from model.renderformer.architectures import build, load_config
 from model.renderformer.guided.config import GuideConfig, GuidedConfig
 from model.renderformer.guided.flops import forward_flops
+from model.renderformer.guided.inputs import Surface
 from model.renderformer.guided.light import diffuse_light, joint_masking, masking, specular_light, vector_form_factor
-from model.renderformer.guided.network import GuidedNetwork
+from model.renderformer.guided.network import GuidedNetwork, share_lobes
 from model.renderformer.network import to_radiance
 from model.renderformer.recipe import FitConfig
 from model.renderformer.training import fit
@@ -184,11 +185,11 @@ def test_before_training_the_image_is_the_closed_form(rung):
     rays, expected = known.rays, torch.zeros_like(known.rays.position)
     if guide.light:
         for light in range(2):
-            radiance = scenes.radiance[:, None, light] * known.seen[..., light, None]
-            expected += rays.diffuse * known.diffuse[..., light, None] * radiance
-            expected += rays.specular * known.specular[..., light, None] * radiance
+            radiance = scenes.radiance[:, None, light] * known.direct.seen[..., light, None]
+            expected += rays.diffuse * known.direct.diffuse[..., light, None] * radiance
+            expected += rays.specular * known.direct.specular[..., light, None] * radiance
     if guide.mirror or guide.lobe:
-        expected += rays.specular * known.reflected
+        expected += rays.specular * known.reflected.repeat_interleave(4, dim=1)
     expected = (expected * rays.there).unflatten(1, (-1, 4)).mean(dim=2) * scenes.scale[:, None, None]
     size = (2, VIEWS, 2, 2, 8, 8, 3)  # bundles of 8 x 8 pixels
     expected = expected.view(size).transpose(3, 4).reshape(2, VIEWS, SIDE, SIDE, 3)
@@ -211,6 +212,23 @@ def test_the_closed_form_is_linear_in_light():
     relit = data["emission"].copy()
     relit[:, :2] *= factors
     torch.testing.assert_close(sum(parts), image(model, {**data, "emission": relit}), rtol=2e-5, atol=1e-5)
+
+
+def test_lobes_are_shared_by_neighbours_that_see_the_same():
+    """Four pixels in a row of a bundle: two near one another, one around a corner, one that hits nothing."""
+    radiance = torch.tensor([[1.0, 3.0, 10.0, 7.0]])[..., None].expand(1, 4, 3)
+    position = torch.tensor([[[0, 0, 0], [0.001, 0, 0], [0.002, 0, 0], [0.003, 0, 0]]])
+    normal = torch.tensor([[[0, 0, 1.0], [0, 0, 1], [1, 0, 0], [0, 0, 1]]])
+    there = torch.tensor([[1.0, 1, 1, 0]])[..., None]
+
+    def shared(roughness: float) -> torch.Tensor:
+        rough = torch.full((1, 4, 1), roughness)
+        surface = Surface(position, normal, normal, radiance, radiance, rough, there)
+        return share_lobes(radiance, position, surface, torch.full((1, 4, 1), 0.5), 4)[0, :, 0]
+
+    torch.testing.assert_close(shared(0.6), torch.tensor([2.0, 2.0, 10.0, 7.0]), atol=0.01, rtol=0)
+    torch.testing.assert_close(shared(0.01), radiance[0, :, 0])  # a mirror shares nothing
+    assert shared(0.6).sum() == pytest.approx(21, abs=0.05)  # no light is made
 
 
 @pytest.mark.parametrize("tokens", ["none", "lookup", "encoder"])

@@ -128,10 +128,14 @@ class Hits:
         """(T, 3, C) of corners -> (B, M, C)."""
         return (values[self.triangle] * self.weights[..., None]).sum(dim=-2)
 
-    def point_weights(self) -> Tensor:
-        """(B, M, 4): the shares of a triangle's ``POINTS``, linear within each triangle of two corners and the centroid."""
+    def between_points(self, values: Tensor, rows: Tensor | None = None) -> Tensor:
+        """(T, 4, C), of the triangles' ``POINTS`` -> (B, M, C): linear within each triangle of two corners and the centroid.
+
+        rows: (B, M) into ``values``, where they are not one for each triangle.
+        """
         least = self.weights.min(dim=-1, keepdim=True).values
-        return torch.cat([self.weights - least, 3 * least], dim=-1)
+        shares = torch.cat([self.weights - least, 3 * least], dim=-1)
+        return (values[self.triangle if rows is None else rows] * shares[..., None]).sum(dim=-2)
 
 
 @dataclass

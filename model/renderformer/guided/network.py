@@ -35,6 +35,7 @@ from model.renderformer.layers import LAYER_EPS, DecoderLayer, EncoderLayer, Fee
 
 FREQUENCIES = 4  # of an encoded position: pi, 2 pi, 4 pi, 8 pi
 SOFT = 0.02  # visibility is corrected as if it were this far from 0 and 1
+SHARED = 0.7  # of a lobe's width: how far apart pixels are that share what their lobes see
 AT_ONCE = 300_000  # pairs of ray and light that are computed together where no gradient is kept
 
 
@@ -121,11 +122,6 @@ def _frequencies(positions: Tensor) -> Tensor:
     return math.pi * 2.0 ** torch.arange(FREQUENCIES, device=positions.device)
 
 
-def positive(x: Tensor) -> Tensor:
-    """max(x, 0), with a gradient also where that is flat: what starts at zero could not rise otherwise."""
-    return x.clamp(min=0) + 0.1 * (x - x.detach()) * (x <= 0)
-
-
 @dataclass
 class Lit:
     """What the closed forms say of the scenes, before any network: kept between views.
@@ -199,6 +195,7 @@ class GuidedNetwork(Network):
     def __init__(self, config: GuidedConfig):
         super().__init__()
         self.config = config
+        self.gradient_leak = 0.1
         dim = config.token_dim
         inputs = PIXEL_FEATURES
         if config.tokens != "none":
@@ -370,116 +367,102 @@ class GuidedNetwork(Network):
 
     def _known(self, encoded: Encoded, pixels: Pixels) -> Known:
         """All that needs no weights."""
-        scenes, guide = encoded.scenes, self.config.guide
+        scenes = encoded.scenes
         eye = pixels.eye.repeat_interleave(pixels.bundles * self.config.bundle**2, dim=1)  # (B, M, 3)
         rays = Surface.at(pixels.hit, scenes, eye.repeat_interleave(SUBSAMPLES, dim=1))
+        direct = self._direct(scenes, pixels, rays)
+        main, surface = _main(pixels, rays)
+        mirror = self._reflected(encoded, surface, pixels.mirror)
+        coverage = _mean(rays.there, 1)
+        means = Surface(**{name: _mean(value, 1) / coverage.clamp(min=1 / SUBSAMPLES) for name, value in vars(rays).items()})
+        reflected, deviation = self._reflections(encoded, pixels, rays, means, mirror, surface)
+        features = [
+            encode_position(means.position),
+            means.normal,
+            surface.to_eye,
+            surface.mirrored,
+            (surface.to_eye * surface.normal).sum(dim=-1, keepdim=True),
+            means.diffuse,
+            means.specular,
+            means.roughness,
+            means.roughness.clamp(min=1e-2).log(),
+            coverage,
+            main.weights * main.there,
+            *self._light_sums(scenes, direct, coverage),
+            *self._mirror_features(mirror, surface),
+            torch.log1p(reflected) * float(self.config.guide.lobe),
+            torch.log1p(deviation),
+        ]
+        lights = self._light_features(scenes, surface, coverage, direct)
+        return Known(torch.cat(features, dim=-1), lights, rays, direct, reflected, means.position, coverage, main)
+
+    def _direct(self, scenes: Scenes, pixels: Pixels, rays: Surface) -> Direct:
         factor = vector_form_factor(rays.position[:, :, None], scenes.light_corners[:, None])  # (B, M 4, L, 3)
         normal = rays.normal[:, :, None]
         diffuse = diffuse_light(factor, normal)
         specular = specular_light(factor, normal, rays.to_eye[:, :, None], rays.alpha[:, :, None])
-        if guide.shadow_rays:
+        seen = torch.ones_like(diffuse)
+        if self.config.guide.shadow_rays:
             seen = pixels.seen
-        elif guide.visibility:
-            seen = (scenes.seen[pixels.hit.triangle] * pixels.hit.point_weights()[..., None]).sum(dim=-2)
-        else:
-            seen = torch.ones_like(diffuse)
-        reflected, weight = self._reflected(encoded, rays, pixels.lobe)
-        main, surface = _main(pixels, rays)
-        mirror, mirror_weight = self._reflected(encoded, surface, pixels.mirror)
-        second = Surface.at(pixels.mirror, scenes, surface.position)
-        highlight = self._highlight(encoded, second, pixels.mirror)
-        if not guide.lobe:
-            image = (mirror + second.specular * highlight) * mirror_weight
-            reflected, weight = image.repeat_interleave(SUBSAMPLES, dim=1), torch.ones_like(weight)
-        radiance = scenes.radiance[:, None]
+        elif self.config.guide.visibility:
+            seen = pixels.hit.between_points(scenes.seen)
+        return Direct(factor, diffuse, specular, seen)
 
-        def per_pixel(values: Tensor) -> Tensor:
-            """The mean over those of a pixel's rays that hit something."""
-            return _mean(values * rays.there, 1) / coverage.clamp(min=0.25)
-
-        coverage = _mean(rays.there, 1)
-        mean = {name: per_pixel(getattr(rays, name)) for name in ("position", "normal", "diffuse", "specular", "roughness")}
-        light = [
-            torch.log1p(per_pixel((part[..., None] * radiance).sum(dim=-2)))
-            for part in (diffuse, specular, diffuse * seen, specular * seen)
-        ]
-        lobe = reflected * weight
-        lobe_mean = per_pixel(lobe)
-        cosine = (surface.to_eye * surface.normal).sum(dim=-1, keepdim=True)
-        away = second.position - surface.position
-        distance = away.norm(dim=-1, keepdim=True)
-        there = pixels.mirror.there
-        if not guide.light:
-            light = [torch.zeros_like(part) for part in light]
-        behind = [
-            away, distance, second.normal, second.diffuse, second.specular, second.roughness, torch.log1p(mirror),
-            torch.log1p(highlight), torch.ones_like(distance),
-        ]  # fmt: skip
-        if not guide.mirror:
-            behind = [torch.zeros_like(part) for part in behind]
-        features = [
-            encode_position(mean["position"]),
-            mean["normal"],
-            surface.to_eye,
-            surface.mirrored,
-            cosine,
-            mean["diffuse"],
-            mean["specular"],
-            mean["roughness"],
-            mean["roughness"].clamp(min=1e-2).log(),
-            coverage,
-            main.weights * main.there,
-            *light,
-            *[part * there for part in behind],
-            torch.log1p(lobe_mean) * float(guide.lobe),
-            torch.log1p(_deviation(lobe, coverage)) * float(guide.lobe),
-        ]
-        return Known(
-            torch.cat(features, dim=-1),
-            self._light_features(scenes, surface, coverage, diffuse, specular, seen, factor),
-            rays,
-            seen,
-            diffuse,
-            specular,
-            lobe,
-            mean["position"],
-            coverage,
-            main,
-        )
-
-    def _reflected(self, encoded: Encoded, surface: Surface, hits: Hits) -> tuple[Tensor, Tensor]:
-        """Radiance (B, M, 3) that reflections see without the lights, and (B, M, 1) what a white lobe returns of it."""
+    def _reflected(self, encoded: Encoded, surface: Surface, hits: Hits) -> Reflected:
+        """What reflections at ``surface`` hit, and how it is lit."""
         scenes = encoded.scenes
-        position = hits.interpolate(scenes.corners)
-        ways = position - surface.position
-        side = ((ways * face_normals(scenes.corners)[hits.triangle]).sum(dim=-1) > 0).long()  # 0: its front is seen
-        light = (encoded.lit.light[hits.triangle, side] * hits.point_weights()[..., None]).sum(dim=-2)
-        diffuse = scenes.diffuse[hits.triangle]
-        if not self.config.guide.light:
-            light = torch.zeros_like(light)
+        second = Surface.at(hits, scenes, surface.position)
+        ways = second.position - surface.position
+        back = ((ways * face_normals(scenes.corners)[hits.triangle]).sum(dim=-1) > 0).long()
+        light = hits.between_points(encoded.lit.light.flatten(0, 1), 2 * hits.triangle + back)
         out = F.normalize(ways, dim=-1)
         eye, away = ((surface.normal * way).sum(dim=-1) for way in (surface.to_eye, out))
         returned = joint_masking(surface.alpha, eye, away) / masking(surface.alpha, eye)
         there = hits.there * surface.there * (away > 0)[..., None]
-        return diffuse * light * there, returned[..., None] * there
+        return Reflected(
+            second, ways, light * there, self._highlight(scenes, second, hits) * there, returned[..., None] * there
+        )
 
-    def _highlight(self, encoded: Encoded, surface: Surface, hits: Hits) -> Tensor:
+    def _highlight(self, scenes: Scenes, surface: Surface, hits: Hits) -> Tensor:
         """(B, M, 3): the lights in a white lobe of surfaces, as far as the triangles' points see them."""
-        scenes = encoded.scenes
         factor = vector_form_factor(surface.position[:, :, None], scenes.light_corners[:, None])
         shape = specular_light(factor, surface.normal[:, :, None], surface.to_eye[:, :, None], surface.alpha[:, :, None])
         if self.config.guide.visibility:
-            shape = shape * (scenes.seen[hits.triangle] * hits.point_weights()[..., None]).sum(dim=-2)
-        return (shape[..., None] * scenes.radiance[:, None]).sum(dim=-2) * hits.there
+            shape = shape * hits.between_points(scenes.seen)
+        return (shape[..., None] * scenes.radiance[:, None]).sum(dim=-2)
 
-    def _light_features(
-        self, scenes: Scenes, surface: Surface, coverage: Tensor, diffuse: Tensor, specular: Tensor, seen: Tensor,
-        factor: Tensor,
-    ) -> Tensor:  # fmt: skip
+    def _reflections(
+        self, encoded: Encoded, pixels: Pixels, rays: Surface, means: Surface, mirror: Reflected, surface: Surface
+    ) -> tuple[Tensor, Tensor]:
+        """(B, M, 3) twice: radiance that a white lobe returns of what reflections hit, the lights left out; and how far apart
+        the rays of the pixel are in it."""
+        none = torch.zeros_like(means.position)
+        if not self.config.guide.lobe:
+            return (mirror.image if self.config.guide.mirror else none), none
+        lobe = self._reflected(encoded, rays, pixels.lobe).image
+        mean = _per_pixel(lobe, rays)
+        return share_lobes(mean, means.position, surface, mirror.distance, self.config.bundle**2), _deviation(lobe)
+
+    def _light_sums(self, scenes: Scenes, direct: Direct, coverage: Tensor) -> list[Tensor]:
+        """Of each pixel the closed forms of all lights together, diffuse and specular: open, and as far as lights are seen."""
+        parts = (direct.diffuse, direct.specular, direct.diffuse * direct.seen, direct.specular * direct.seen)
+        sums = [_mean((part[..., None] * scenes.radiance[:, None]).sum(dim=-2), 1) for part in parts]
+        share = coverage.clamp(min=1 / SUBSAMPLES)
+        return [torch.log1p(total / share) * float(self.config.guide.light) for total in sums]
+
+    def _mirror_features(self, mirror: Reflected, surface: Surface) -> list[Tensor]:
+        second = mirror.surface
+        parts = [
+            mirror.ways, mirror.distance, second.normal, second.diffuse, second.specular, second.roughness,
+            torch.log1p(second.diffuse * mirror.light), torch.log1p(mirror.highlight), surface.there,
+        ]  # fmt: skip
+        return [part * second.there * float(self.config.guide.mirror) for part in parts]
+
+    def _light_features(self, scenes: Scenes, surface: Surface, coverage: Tensor, direct: Direct) -> Tensor:
         """(B, M, L, LIGHT_FEATURES): direction, size, cosine, closed forms and visibility of each light in each pixel."""
-        share = coverage.clamp(min=0.25)
-        diffuse, specular, seen = (_mean(values, 1) / share for values in (diffuse, specular, seen))
-        vector = _mean(factor, 1)
+        share = coverage.clamp(min=1 / SUBSAMPLES)
+        diffuse, specular, seen = (_mean(values, 1) / share for values in (direct.diffuse, direct.specular, direct.seen))
+        vector = _mean(direct.factor, 1)
         size = vector.norm(dim=-1, keepdim=True)
         direction = vector / size.clamp(min=1e-12)
         radiance = scenes.radiance.mean(dim=-1)[:, None]
@@ -491,44 +474,78 @@ class GuidedNetwork(Network):
 
     def _compose(self, scenes: Scenes, known: Known, outputs: Tensor, corrections: Tensor) -> Tensor:
         """The image (B, M, 3) from the head's outputs."""
-        rays, radiance = known.rays, scenes.radiance[:, None]
+        rays, direct, radiance = known.rays, known.direct, scenes.radiance[:, None]
         indirect, reflected, gate = outputs.split([3, 3, 1], dim=-1)
-        soft = known.seen.clamp(SOFT, 1 - SOFT)
-        logits = torch.logit(soft)
-
-        def corrected(channel: int) -> Tensor:
-            change = corrections[..., channel].repeat_interleave(SUBSAMPLES, dim=1)
-            return (known.seen + torch.sigmoid(logits + change) - soft).clamp(0, 1)
+        soft = direct.seen.clamp(SOFT, 1 - SOFT)
 
         def spread(values: Tensor) -> Tensor:
             return values.repeat_interleave(SUBSAMPLES, dim=1)
 
-        diffuse = spread(positive(indirect))
-        specular = spread(positive(reflected))
+        def light(closed_form: Tensor, change: Tensor) -> Tensor:
+            seen = (direct.seen + torch.sigmoid(torch.logit(soft) + spread(change)) - soft).clamp(0, 1)
+            return ((closed_form * seen)[..., None] * radiance).sum(dim=-2)
+
+        diffuse, specular = spread(self.positive(indirect)), spread(self.positive(reflected))
         if self.config.guide.light:
-            diffuse = diffuse + ((known.diffuse * corrected(0))[..., None] * radiance).sum(dim=-2)
-            specular = specular + ((known.specular * corrected(1))[..., None] * radiance).sum(dim=-2)
-        if self.config.guide.mirror or self.config.guide.lobe:
-            specular = specular + spread(positive(1 + gate)) * known.reflected
+            diffuse = diffuse + light(direct.diffuse, corrections[..., 0])
+            specular = specular + light(direct.specular, corrections[..., 1])
+        specular = specular + spread(self.positive(1 + gate) * known.reflected)
         image = (rays.diffuse * diffuse + rays.specular * specular) * rays.there
         return _mean(image, 1) * scenes.scale[:, None, None]
+
+    def positive(self, x: Tensor) -> Tensor:
+        """max(x, 0), with some gradient also where that is flat: what starts at zero could not rise otherwise."""
+        return x.clamp(min=0) + self.gradient_leak * (x - x.detach()) * (x <= 0)
+
+    def leak_gradient(self, share: float) -> None:
+        self.gradient_leak = share
+
+
+@dataclass
+class Direct:
+    """The closed forms at B x M 4 rays, of L lights. factor: (B, M 4, L, 3); diffuse, specular, seen: (B, M 4, L)."""
+
+    factor: Tensor
+    diffuse: Tensor
+    specular: Tensor
+    seen: Tensor
+
+
+@dataclass
+class Reflected:
+    """What M reflections of B scenes hit. ways: (B, M, 3), from where they leave. light: (B, M, 3), of a white diffuse surface
+    there; highlight: the same of a white lobe. returned: (B, M, 1), what a white lobe returns of it to the eye."""
+
+    surface: Surface
+    ways: Tensor
+    light: Tensor
+    highlight: Tensor
+    returned: Tensor
+
+    @property
+    def distance(self) -> Tensor:
+        """(B, M, 1)."""
+        return self.ways.norm(dim=-1, keepdim=True)
+
+    @property
+    def image(self) -> Tensor:
+        """(B, M, 3), radiance that a white lobe returns."""
+        return (self.surface.diffuse * self.light + self.surface.specular * self.highlight) * self.returned
 
 
 @dataclass
 class Known:
     """What needs no weights, of B x M pixels and their M 4 rays.
 
-    features: (B, M, PIXEL_FEATURES). lights: (B, M, L, LIGHT_FEATURES). rays: what the rays hit.
-    seen, diffuse, specular: (B, M 4, L), visibility and closed forms. reflected: (B, M 4, 3), radiance in reflections.
+    features: (B, M, PIXEL_FEATURES). lights: (B, M, L, LIGHT_FEATURES). rays: what the rays hit. direct: how it is lit.
+    reflected: (B, M, 3), radiance in reflections.
     position: (B, M, 3) and coverage (B, M, 1), of the pixel. main: the main ray of each pixel.
     """
 
     features: Tensor
     lights: Tensor
     rays: Surface
-    seen: Tensor
-    diffuse: Tensor
-    specular: Tensor
+    direct: Direct
     reflected: Tensor
     position: Tensor
     coverage: Tensor
@@ -545,10 +562,45 @@ def _mean(values: Tensor, dim: int) -> Tensor:
     return values.unflatten(dim, (-1, SUBSAMPLES)).mean(dim=dim + 1)
 
 
-def _deviation(values: Tensor, coverage: Tensor) -> Tensor:
-    """(B, M 4, 3) -> (B, M, 3): how far a pixel's rays lie apart, 0 where they miss."""
+def share_lobes(radiance: Tensor, position: Tensor, surface: Surface, distance: Tensor, size: int) -> Tensor:
+    """(B, M, 3): reflected radiance, averaged over the pixels of a bundle as far as their lobes see the same.
+
+    Few rays of a wide lobe are noise; the neighbours' rays are more of them. Two pixels share where they are nearer to one
+    another than the lobe is wide at the distance of what it sees, and their normals differ by less than the lobe is wide. So a
+    mirror shares nothing. ``size``: pixels of a bundle.
+    """
+
+    def bundles(values: Tensor) -> Tensor:
+        return values.unflatten(1, (-1, size))  # (B, bundles, size, C)
+
+    alpha = surface.alpha[..., None]
+    there = bundles(surface.there)
+    reach = bundles(SHARED * alpha * torch.where(distance > 0, distance, 1.0)).clamp(min=1e-5)
+    width = bundles(SHARED * alpha)
+    apart = (
+        _squared_distances(bundles(position)) / reach.square() + _squared_distances(bundles(surface.normal)) / width.square()
+    )
+    ratio = bundles(alpha) / bundles(alpha).transpose(-1, -2)
+    alike = (ratio - 1).abs() < 0.1
+    weight = torch.exp(-apart / 2) * alike * there * there.transpose(-1, -2)
+    weight = weight + torch.eye(size, device=weight.device) * 1e-6
+    return (weight @ bundles(radiance) / weight.sum(dim=-1, keepdim=True)).flatten(1, 2)
+
+
+def _squared_distances(points: Tensor) -> Tensor:
+    """(..., N, C) -> (..., N, N)."""
+    return (points[..., :, None, :] - points[..., None, :, :]).square().sum(dim=-1)
+
+
+def _per_pixel(values: Tensor, rays: Surface) -> Tensor:
+    """(B, M 4, C) -> (B, M, C): the mean over those of a pixel's rays that hit something."""
+    return _mean(values * rays.there, 1) / _mean(rays.there, 1).clamp(min=1 / SUBSAMPLES)
+
+
+def _deviation(values: Tensor) -> Tensor:
+    """(B, M 4, C) -> (B, M, C): how far a pixel's rays lie apart."""
     grid = values.unflatten(1, (-1, SUBSAMPLES))
-    return (grid.amax(dim=2) - grid.amin(dim=2)) * (coverage > 0)
+    return grid.amax(dim=2) - grid.amin(dim=2)
 
 
 def _main(pixels: Pixels, rays: Surface) -> tuple[Hits, Surface]:
