@@ -35,7 +35,7 @@ stages.renderformer.inference
 stages.renderformer.importing
 stages.renderformer.rendering
 stages.renderformer.dataset  stages.renderformer.scenes  stages.renderformer.objects
-stages.renderformer.views  stages.renderformer.hub
+stages.renderformer.views  stages.renderformer.guides  stages.renderformer.hub
 stages.renderformer.records
 stages.neuras.commands  stages.neuras.viewing
 stages.neuras.s02_atlas  stages.neuras.s03_fit  stages.neuras.s04_bake  stages.neuras.s05_evaluate
@@ -53,10 +53,17 @@ stages.graphics.geometry.colours  stages.graphics.geometry.measure
 stages.graphics.geometry.records  stages.graphics.geometry.paths
 stages.graphics.geometry  stages.graphics.mitsuba  stages.graphics.statistics  stages.graphics.video  \
 stages.graphics.device  stages.graphics.denoising  stages.graphics.panels
-stages.graphics.metrics  stages.graphics.exr
+stages.graphics.metrics  stages.graphics.exr  stages.graphics.casting
 stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages.graphics.page  stages.graphics.browser
 stages.graphics
-model.renderformer  model.neuras
+model.renderformer.training  model.neuras
+model.renderformer.checkpoint
+model.renderformer.architectures  model.renderformer.reference  model.renderformer.initial  model.renderformer.timing
+model.renderformer.guided
+model.renderformer.network
+model.renderformer.flops  model.renderformer.dpt  model.renderformer.inputs  model.renderformer.losses
+model.renderformer.layers  model.renderformer.base  model.renderformer.config  model.renderformer.recipe
+model.renderformer
 model.training
 model.fetching
 model.lpips  model.inception  model.timing

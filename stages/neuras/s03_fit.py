@@ -126,7 +126,7 @@ class Fit(RunStage):
         import torch
 
         from model.neuras.fitting import Outputs, fit
-        from stages.neuras.rasterizing.casting import Caster
+        from stages.graphics.casting import Caster
         from stages.neuras.records import CaptureInfo, frames, load_atlas
 
         if config.threads is not None:

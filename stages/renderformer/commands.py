@@ -108,15 +108,20 @@ def command_export(arguments: argparse.Namespace) -> int:
 
 
 def command_sweep(arguments: argparse.Namespace) -> int:
-    from stages.renderformer.evaluation.ablation import sweep
+    from stages.renderformer.evaluation import ablation, comparison
 
-    return sweep(arguments.table, arguments.rows, arguments.words, Path(arguments.out or f"runs/{arguments.table}"))
+    out = Path(arguments.out or f"runs/{arguments.table}")
+    if arguments.table in ablation.tables():
+        return ablation.sweep(arguments.table, arguments.rows, arguments.words, out)
+    return comparison.sweep(arguments.table, arguments.rows, arguments.words, out, arguments.until)
 
 
 def command_table(arguments: argparse.Namespace) -> int:
-    from stages.renderformer.evaluation.ablation import write_table
+    from stages.renderformer.evaluation import ablation, comparison
 
-    return write_table(arguments.table, arguments.rows, arguments.words, Path(arguments.out or f"runs/{arguments.table}"))
+    out = Path(arguments.out or f"runs/{arguments.table}")
+    write = ablation.write_table if arguments.table in ablation.tables() else comparison.write_page
+    return write(arguments.table, arguments.rows, arguments.words, out)
 
 
 def command_import(arguments: argparse.Namespace) -> int:
@@ -249,7 +254,7 @@ def add_commands(parsers: Any, program: str) -> None:
     sub.usage = f"{program} import {of_scene}  |  {program} import {of_folder}"
 
     for name, function, summary in (
-        ("sweep", command_sweep, "train and evaluate the rows of the paper's table 1, then write the table"),
+        ("sweep", command_sweep, "train and evaluate the rows of a table (the paper's table 1, priors), then write it"),
         ("table", command_table, "write the table of the rows that the store holds"),
     ):
         sub = add(name, function, summary, "table1_small --rows full,no_dpt jobs=2")
@@ -257,7 +262,9 @@ def add_commands(parsers: Any, program: str) -> None:
             "table", nargs="?", default="table1_small", help="folder of conf/renderformer/experiment (default: table1_small)"
         )
         sub.add_argument("--rows", type=lambda text: text.split(","), help="some rows, comma-separated (default: all)")
-        sub.add_argument("-o", "--out", help="folder of table.md, table.json and table.png (default: runs/TABLE)")
+        sub.add_argument("-o", "--out", help="folder of what is written: table.* or report.* (default: runs/TABLE)")
+        if name == "sweep":
+            sub.add_argument("--until", choices=("train", "evaluate"), default="evaluate", help="stop after this stage")
         sub.usage = f"{program} {name} [TABLE] [--rows ROW,...] [-o FOLDER] [name=value ...] [--debug]"
 
     scene_help = (

@@ -21,9 +21,9 @@ from pipeline.store.draft import Draft
 from pipeline.store.files import hash_file
 from stages.graphics.arrays import pack_json
 from stages.graphics.cameras import Camera
+from stages.graphics.casting import Caster
 from stages.graphics.page import png
 from stages.neuras.evaluation.renderers import Reference
-from stages.neuras.rasterizing.casting import Caster
 from stages.neuras.records import FRAME, CaptureInfo, FrameRecord, save
 from stages.neuras.s03_fit import Fit, FitStageConfig
 from tests.model.lpips import write_weights

@@ -295,7 +295,9 @@ def test_draco_data_may_not_hold_more_than_is_stated(tmp_path: Path) -> None:
             if fits:
                 assert len(load.load_mesh(tmp_path / "a.glb", tmp_path, **LIMITS).faces) == len(faces)
             else:
-                with pytest.raises(Reject, match=f"unreadable: a.glb: .*buffer view 0: Draco data: {len(faces)} faces where 12 are stated"):
+                with pytest.raises(
+                    Reject, match=f"unreadable: a.glb: .*buffer view 0: Draco data: {len(faces)} faces where 12 are stated"
+                ):
                     load.load_mesh(tmp_path / "a.glb", tmp_path, **LIMITS)
 
 
