@@ -129,6 +129,12 @@ def test_cameras_keep_place_lens_and_aspect(scene):
     assert ahead == pytest.approx(np.array([-3, 7, -2.6]) / np.linalg.norm([-3, 7, -2.6]), abs=1e-5)
 
 
+def test_an_orbit_keeps_the_aspect(scene):
+    from stages.renderformer.inference.orbit import orbit
+
+    assert [orbit(scene, 5).picture_size(view, 64) for view in range(5)] == [(36, 64)] * 5
+
+
 def test_an_orthographic_camera_sees_the_middle_as_large(tmp_path):
     gltf = boxed()
     gltf.tree["cameras"][0] = {"type": "orthographic", "orthographic": {"xmag": 2, "ymag": 1, "znear": 0, "zfar": 9}}

@@ -213,7 +213,7 @@ def predict(context: Context, arguments: Mapping[str, Any]) -> dict[str, Any]:
     began = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        image = model.render(scene, 0, side)
+        image = model.render(scene, 0, (side, side))
     seconds = time.perf_counter() - began
     keep(context, "predicted", arguments, image)
     notes = [str(warning.message) for warning in caught]
