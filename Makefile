@@ -1,6 +1,7 @@
 # make data train eval    the whole line on the embedded default; any combination works
 # make data train eval SYSTEM=NAME    the same of another system
 # make sweep              table 1 of the paper, small: twelve variants over one dataset, and the table
+# make sweep TABLE=priors the same of the priors that a renderer may be given
 # make test               the tests
 # Everything installs itself into .venv. All targets are phony: the store decides what is stale.
 
@@ -55,8 +56,22 @@ endif
 		{ echo "error: pymeshlab needs system libraries: apt-get install libgl1 libopengl0"; exit 2; }
 	@rm -f $(VENV)/ready-* && touch $@
 
+# The default of renderformer is two models on one dataset; model=, experiment= or train= in ARGS chooses one
+DEFAULT := $(if $(filter-out renderformer,$(SYSTEM))$(filter model=% experiment=% train=%,$(ARGS)),,default)
+
+ifeq ($(DEFAULT),)
 data train eval: setup
 	@$(RUN) -m pipeline system=$(SYSTEM) stage=$@ $(ARGS)
+else
+data: setup
+	@$(RUN) -m pipeline stage=data shard.guides=true $(ARGS)
+
+train: setup
+	@$(RUN) -m stages.cli sweep $(DEFAULT) --until train $(ARGS)
+
+eval: setup
+	@$(RUN) -m stages.cli sweep $(DEFAULT) $(ARGS)
+endif
 
 probes: setup
 	@$(RUN) -m pipeline stage=probe probe=$(subst $(EMPTY) $(EMPTY),$(COMMA),$(PROBES)) -m $(ARGS)

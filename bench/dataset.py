@@ -22,7 +22,7 @@ import numpy as np
 from pipeline.store import Artifact, Store, iter_inputs
 from stages.graphics import exr
 from stages.graphics.exr import decode_lights
-from stages.renderformer.dataset import BatchConfig, Batches, Relight, ShardDataset, prefetch
+from stages.renderformer.dataset import BatchConfig, Batches, Needs, Relight, ShardDataset, prefetch
 from stages.renderformer.dataset.encoding import decode_scene
 from stages.renderformer.dataset.interchange import write_hdf5
 from stages.renderformer.dataset.shards import Reader
@@ -119,7 +119,7 @@ def bytes_and_speed(dataset: ShardDataset, count: int, folder: Path, what: set[s
     for label, views, layers in (("no images", 0, ()), ("2 views, image", 2, ()), ("2 views, all layers", 2, everything)):
         config = BatchConfig(batch_scenes=4, views_per_scene=views, bucket=4, **relit)
         fresh = ShardDataset(dataset.source.root, dataset.split, cache_mb=0)
-        batches = Batches(fresh, config, layers=layers)
+        batches = Batches(fresh, config, needs=Needs(layers=layers))
         steps = n // config.batch_scenes
 
         def load(batches: Batches = batches, steps: int = steps) -> None:

@@ -3,6 +3,7 @@
     python bench/model.py        # 205M, 256 px, 1,536 triangles, 4 views of one scene, fp32, against the plain path
     python bench/model.py --models tiny,143m,base --triangles 768,1536,4096 --resolutions 256,512 --views 1,4
     python bench/model.py --train --precisions fp32,mixed,bf16 --scenes 4 [--compile] [--recompute]
+    python bench/model.py --train --lpips # a step with LPIPS in its loss against one without, by turns
     python bench/model.py --attention     # ways to attend within scenes of different size
 
 Random triangles and weights; every row in a fresh process, best of several repeats. "of mm": floating-point operations of
@@ -30,6 +31,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from model import timing  # noqa: E402
+from model.lpips import LPIPS, Features  # noqa: E402
 from model.renderformer import layers, reference  # noqa: E402
 from model.renderformer.config import ModelConfig  # noqa: E402
 from model.renderformer.flops import TRAINING, forward_flops, ideal_seconds  # noqa: E402
@@ -118,11 +120,14 @@ def one(setup: dict[str, Any]) -> dict[str, Any]:
         model.compile_layers()
     optimizer = torch.optim.AdamW(model.parameters()) if setup["train"] else None
 
-    def step() -> torch.Tensor:
+    # random weights cost what the published ones do
+    lpips = LPIPS(Features("vgg")).to(device) if setup["lpips"] else None
+
+    def step(loss_network: LPIPS | None = None) -> torch.Tensor:
         if optimizer is None:
             return model.render(scenes, cameras, fov, setup["resolution"], precision)
         y = model(scenes, cameras, fov, setup["resolution"], precision)
-        image_loss(y, image, None, 0.0).backward()
+        image_loss(y, image, loss_network, 0.05).backward()
         optimizer.step()
         optimizer.zero_grad()
         return y
@@ -148,10 +153,14 @@ def one(setup: dict[str, Any]) -> dict[str, Any]:
         return {name: 2 * side**3 / timed(lambda m=m: torch.mm(*m), device)[0] for name, m in matrices.items()}
 
     step()  # warm-up, and compilation
-    best, best_peaks, best_plain, difference = float("inf"), peaks(), float("inf"), None
+    if lpips is not None:
+        step(lpips)
+    best, best_peaks, best_plain, best_lpips, difference = float("inf"), peaks(), float("inf"), float("inf"), None
     for _ in range(setup["repeats"]):
         seconds, y = timed(step, device)
         best = min(best, seconds)
+        if lpips is not None:
+            best_lpips = min(best_lpips, timed(lambda: step(lpips), device)[0])
         if setup["plain"]:
             seconds, slow = timed(plain, device)
             best_plain, difference = min(best_plain, seconds), float((y - slow).abs().max())
@@ -187,6 +196,7 @@ def one(setup: dict[str, Any]) -> dict[str, Any]:
         "memory_gb": memory / 2**30,
         "mm": {name: value / 1e9 for name, value in best_peaks.items()},
         "parts": shares,
+        "lpips": best_lpips,
     }
     return row | ({"plain": best_plain, "difference": difference, "spread": spread} if setup["plain"] else {})
 
@@ -248,6 +258,7 @@ def main() -> int:
         parser.add_argument(f"--{name}", default=default, help="comma-separated (default: %(default)s)")
     parser.add_argument("--scenes", type=int, default=1, help="scenes in the batch")
     parser.add_argument("--train", action="store_true", help="a training step instead of a forward pass")
+    parser.add_argument("--lpips", action="store_true", help="with --train: a step with LPIPS (VGG16) in the loss as well")
     parser.add_argument("--compile", action="store_true", help="torch.compile")
     parser.add_argument("--recompute", action="store_true", help="activation checkpointing")
     parser.add_argument("--attention", action="store_true", help="compare ways to compute attention, and stop")
@@ -258,6 +269,8 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.attention:
         return attention(arguments)
+    if arguments.lpips and not arguments.train:
+        parser.error("--lpips is a part of the loss: give --train as well")
     choices = [getattr(arguments, name).split(",") for name in listed]
     # The plain path is compared where the question is one of speed alone: one forward pass in float32.
     plain = not arguments.train and all(len(choice) == 1 for choice in choices) and arguments.precisions == "fp32"
@@ -281,6 +294,9 @@ def main() -> int:
         )
         rates = ", ".join(f"{name} {rate:,.0f} GFLOP/s" for name, rate in row["mm"].items())
         print(f"{'':<13}torch.mm of {MM[arguments.device]}^2: {rates}")
+        if arguments.lpips:
+            ratio = row["lpips"] / row["seconds"]
+            print(f"{'':<13}with LPIPS in the loss: {row['lpips']:.3f} s, {ratio:.2f} times the step without")
         if plain:
             failed = not row["difference"] < TOLERANCE
             print(

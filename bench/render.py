@@ -355,7 +355,7 @@ class BuiltIn:
                 emitter = mi.load_dict({"type": "area", "radiance": shine, "sampling_weight": float(ahead.any())})
                 shapes[f"light{len(shapes)}"] = mesh_of(side + 1e-5 * normal[:, None], None, emitter=emitter)
         self.scene = mi.load_dict({"type": "scene", **shapes})
-        self.sensor = perspective(scene, 0, resolution)
+        self.sensor = perspective(scene, 0, (resolution, resolution))
         self.integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
 
     def render(self, spp: int, seed: int) -> np.ndarray:

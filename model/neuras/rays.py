@@ -39,7 +39,7 @@ class Batch:
     """Pixels (B,) in patches of n x n, patch after patch, row after row.
 
     origins, directions: (B, 3), origins from the skyboxes' centre. uv, spread: (B, 2). detail: (B,). hit, counts: (B,) bool.
-    open: (B,) bool, neither the pixel nor one around it sees the mesh. rgb: (B, 3) in [0, 1].
+    open: (B,) bool, neither the pixel nor one around it sees the mesh. rgb: (B, 3) in [0, 1]. views: (B,) int64, the image.
     """
 
     origins: Tensor
@@ -51,6 +51,7 @@ class Batch:
     counts: Tensor
     open: Tensor
     rgb: Tensor
+    views: Tensor
     patch: int
 
 
@@ -88,6 +89,7 @@ class Pixels:
                 for values in (self.directions, self.uv, self.spread, self.detail, self.hit, self.counts, self.open)
             ),
             self.rgb.index_select(0, pixels).float() / 255,
+            views,
             self.patch,
         )
 

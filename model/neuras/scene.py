@@ -17,6 +17,7 @@ from torch import Tensor
 
 from model.neuras import shading, skyboxes
 from model.neuras.baked import Baked
+from model.neuras.exposure import Exposure
 from model.neuras.losses import PerceptualNetwork
 from model.neuras.maps import Maps, blocks, voxels
 from model.neuras.quantization import clusters, nearest
@@ -52,6 +53,7 @@ class FitConfig:
     sky_side: int = 256  # texels along a face of a skybox
     near_opacity: float = 0.12  # of all skyboxes but the farthest, at the start: far layers explain first
     direction_noise: float = 0.0  # sigma added to the view direction
+    exposure: bool = False  # an affine change of colour per training image
     # Runtime: these do not change the result, or only its rounding
     compile: bool = False
     mixed_precision: bool = False
@@ -93,7 +95,10 @@ class Scene:
             torch.manual_seed(config.seed)
             self.mesh_shader = shading.MeshShader(config.shader).to(self.device)
             self.sky_shader = shading.SkyShader(config.shader).to(self.device)
-        self.rates = {name: _rates(shader.NAMED, config.shader.channels).to(self.device) for name, shader in self.shaders.items()}
+        self.rates = {
+            name: _rates(shader.NAMED, config.shader.channels).to(self.device) for name, shader in self.shaders.items()
+        }
+        self.exposure = Exposure(len(pixels.sizes)).to(self.device) if config.exposure else None
         self.maps = self._start(pixels)
         self.codes: dict[str, Tensor] = {}
         if config.codes:

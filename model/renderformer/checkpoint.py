@@ -1,4 +1,4 @@
-"""Released-format checkpoint folders: ``config.json`` and ``model.safetensors``, read and written strictly.
+"""Checkpoint folders: ``config.json`` and ``model.safetensors``, read and written strictly; RenderFormer's are released ones.
 
 What a model was trained with travels in the safetensors header's metadata, which other readers ignore.
 """
@@ -6,8 +6,11 @@ What a model was trained with travels in the safetensors header's metadata, whic
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import os
+import sys
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -15,16 +18,16 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from model.errors import InputError
-from model.renderformer.config import ModelConfig
-from model.renderformer.network import RenderFormer
+from model.file_kinds import wrong_kind
+from model.renderformer.architectures import build, load_config
+from model.renderformer.base import Network
 from pipeline.atomic import atomic_path, write_atomic
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
+NAMED = 3  # names in an error
 
 
-def save(
-    config: ModelConfig, weights: Mapping[str, Tensor], folder: Path, trained_with: Mapping[str, str] | None = None
-) -> None:
+def save(config: Any, weights: Mapping[str, Tensor], folder: Path, trained_with: Mapping[str, str] | None = None) -> None:
     """Write the folder from a network's config and state dict; each file appears whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
@@ -48,35 +51,65 @@ def _sort_metadata(path: Path) -> None:
         file.write(data)
 
 
-def _check_shapes(config: ModelConfig, stored: Mapping[str, tuple[int, ...]], path: Path) -> None:
+def _check_shapes(config: Any, stored: Mapping[str, tuple[int, ...]], path: Path) -> None:
     """That the file holds the network which the config asks for, before a byte of either is allocated."""
-    layers = config.num_layers + config.view_transformer_n_layers
-    if layers > len(stored):
-        raise InputError(f"{path} holds {len(stored)} tensors, {CONFIG} asks for {layers} layers")
+    if config.depth > len(stored):
+        raise InputError(f"{path} holds {len(stored)} tensors, {CONFIG} asks for {config.depth} layers")
     with torch.device("meta"):
-        expected = {name: tuple(tensor.shape) for name, tensor in RenderFormer(config).state_dict().items()}
-    for kind, differing in (("unknown", stored.keys() - expected.keys()), ("missing", expected.keys() - stored.keys())):
-        if differing:
-            raise InputError(f"{path}: {kind} parameter {', '.join(sorted(differing))} for the network of {CONFIG}")
-    for name, shape in stored.items():
-        if shape != expected[name]:
-            raise InputError(f"{path}: {name} has shape {shape}, {CONFIG} asks for {expected[name]}")
+        expected = {name: tuple(tensor.shape) for name, tensor in build(config).state_dict().items()}
+    unknown, missing = stored.keys() - expected.keys(), expected.keys() - stored.keys()
+    differing = [f"{kind} parameter {_some(names)}" for kind, names in (("missing", missing), ("unknown", unknown)) if names]
+    if differing:
+        raise InputError(f"{path} is not of the network that {CONFIG} describes: {'; '.join(differing)}")
+    wrong = [
+        f"{name} has shape {shape}, not {expected[name]}" for name, shape in sorted(stored.items()) if shape != expected[name]
+    ]
+    if wrong:
+        raise InputError(f"{path}: {CONFIG} asks for other shapes: {_some(wrong)}")
 
 
-def load(folder: Path) -> tuple[RenderFormer, dict[str, str]]:
-    """The model, on the CPU in float32 and in eval mode, and what it says it was trained with (may be empty)."""
+def _some(names: Collection[str]) -> str:
+    """Three of the names, and how many more there are."""
+    first = ", ".join(sorted(names)[:NAMED])
+    return first if len(names) <= NAMED else f"{first} and {len(names) - NAMED:,} more"
+
+
+def _wrapper_prefix(names: Collection[str]) -> str:
+    """What a wrapper put before every name of a state dict, such as ``_orig_mod.module.``; "" for nothing.
+
+    The network's own names have no first part in common.
+    """
+    common = os.path.commonprefix(list(names)) if len(names) > 1 else ""
+    return common[: common.rfind(".") + 1]
+
+
+def _say(note: str) -> None:
+    print(f"note: {note}", file=sys.stderr)
+
+
+def load(folder: Path, say: Callable[[str], None] = _say) -> tuple[Network, dict[str, str]]:
+    """The model, on the CPU in float32 and in eval mode, and what it says it was trained with (may be empty).
+
+    Names may begin as DataParallel, torch.compile or another wrapper leaves them: that is taken off, and said. InputError:
+    the folder holds anything but the network that its config describes.
+    """
     folder = Path(folder)
-    config = ModelConfig.load(folder / CONFIG)
+    config = load_config(folder / CONFIG)
     path = folder / WEIGHTS
     if not path.is_file():
         raise InputError(f"{path} is missing: a checkpoint folder holds {CONFIG} and {WEIGHTS}")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            _check_shapes(config, {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}, path)  # noqa: SIM118
-            state = {name: file.get_tensor(name) for name in sorted(file.keys())}
+            names = sorted(file.keys())
+            prefix = _wrapper_prefix(names)
+            stored = {name.removeprefix(prefix): tuple(file.get_slice(name).get_shape()) for name in names}
+            _check_shapes(config, stored, path)
+            state = {name.removeprefix(prefix): file.get_tensor(name) for name in names}
     except SafetensorError as error:
-        raise InputError(f"{path} is not a safetensors file: {error}") from None
-    model = RenderFormer(config)
+        raise InputError(f"{path} {wrong_kind(path) or f'is not a safetensors file: {error}'}") from None
+    if prefix:
+        say(f"{path}: all names begin with {prefix!r}, as a wrapper around the network left them; it is taken off")
+    model = build(config)
     model.load_state_dict(state)
     return model.eval(), {name: value for name, value in metadata.items() if name != "format"}

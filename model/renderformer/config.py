@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from model.errors import InputError
@@ -142,6 +141,31 @@ class ModelConfig:
         return min(self.vertex_pe_num_freqs, head_dim // 18 * 2)
 
     @property
+    def depth(self) -> int:
+        """Layers of both stages."""
+        return self.num_layers + self.view_transformer_n_layers
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What probes say of the network."""
+        return {"layers": f"{self.num_layers} + {self.view_transformer_n_layers}", "width": self.latent_dim}
+
+    @property
+    def description(self) -> str:
+        """The network's size in words."""
+        return f"{self.num_layers} + {self.view_transformer_n_layers} layers, width {self.latent_dim}"
+
+    @property
+    def bundle_side(self) -> int:
+        """Pixels along the side of a ray bundle."""
+        return self.patch_size
+
+    @property
+    def registers(self) -> int:
+        """Tokens besides those of triangles and rays."""
+        return self.num_register_tokens
+
+    @property
     def resolution_multiple(self) -> int:
         """Image sides must be multiples of this many pixels."""
         return 64 if self.view_transformer_use_swin_attn else self.patch_size
@@ -164,18 +188,6 @@ class ModelConfig:
     def to_dict(self) -> dict[str, Any]:
         """The released ``config.json``'s content."""
         return {name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()}
-
-    @classmethod
-    def load(cls, path: Path) -> ModelConfig:
-        try:
-            data = json.loads(path.read_text())
-        except FileNotFoundError:
-            raise InputError(f"{path} is missing: a checkpoint folder holds config.json and model.safetensors") from None
-        except ValueError as error:
-            raise InputError(f"{path} is not JSON: {error}") from None
-        if not isinstance(data, dict):
-            raise InputError(f"{path} must hold one JSON object")
-        return cls.from_dict(data, str(path))
 
     def dumps(self) -> str:
         return json.dumps(self.to_dict(), indent=2, sort_keys=True) + "\n"

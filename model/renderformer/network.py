@@ -9,19 +9,20 @@ are computed once per stage, and the triangles' keys and values are projected on
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from model.errors import InputError
+from model.renderformer.base import Network, autocast, run_layer
 from model.renderformer.config import ModelConfig
 from model.renderformer.dpt import DPTHead
+from model.renderformer.flops import forward_flops
 from model.renderformer.inputs import Triangles, encode_emission, kept_cells, scenes_of
 from model.renderformer.layers import (
     EMBEDDING_EPS,
@@ -79,13 +80,6 @@ def from_patches(tokens: Tensor, h: int, w: int, patch: int) -> Tensor:
     batch = tokens.shape[0]
     grid = tokens.view(batch, h, w, 3, patch, patch)
     return grid.permute(0, 3, 1, 4, 2, 5).reshape(batch, 3, h * patch, w * patch)
-
-
-def run_layer(layer: nn.Module, *inputs: object) -> Tensor:
-    """The layer's output; where ``activation_checkpointing`` is on, inner results are computed again in the backward pass."""
-    if getattr(layer, "recompute", False) and torch.is_grad_enabled():
-        return checkpoint(layer, *inputs, use_reentrant=False)
-    return layer(*inputs)
 
 
 class Encoder(nn.Module):
@@ -238,7 +232,7 @@ class ViewTransformer(nn.Module):
         return [layer.keys_values(tokens.x[None]) for layer in self.transformer.layers]
 
 
-class RenderFormer(nn.Module):
+class RenderFormer(Network):
     """The whole network; ``state_dict`` holds exactly the released parameter names."""
 
     def __init__(self, config: ModelConfig):
@@ -261,6 +255,38 @@ class RenderFormer(nn.Module):
     def read(self, batch: Mapping[str, Any], device: torch.device | str = "cpu") -> Triangles:
         """This network's input from padded numpy arrays (``model.renderformer.inputs.scenes_of``)."""
         return scenes_of(batch, self.config.texture_channels, self.config.texture_encode_patch_size, device)
+
+    def arguments(self, batch: Mapping[str, Any], device: torch.device | str) -> tuple[Any, ...]:
+        """Scenes, cameras and the images' size."""
+        cameras, fov_deg = (
+            torch.from_numpy(np.ascontiguousarray(batch[name])).to(device, non_blocking=True)
+            for name in ("camera_to_world", "fov_deg")
+        )
+        return self.read(batch, device), cameras, fov_deg, tuple(batch["image"].shape[2:4])
+
+    def frames(
+        self, scene: Mapping[str, Any], views: Iterable[Mapping[str, Any]], size: tuple[int, int], device: Any
+    ) -> Iterator[Tensor]:
+        cameras = list(views)
+        camera_to_world, fov_deg = (
+            torch.from_numpy(np.concatenate([view[name] for view in cameras], axis=1, dtype=np.float32)).to(device)
+            for name in ("camera_to_world", "fov_deg")
+        )
+        for y in self.render_batches(self.read(scene, device), camera_to_world, fov_deg, size):
+            yield from y[0]
+
+    def flops(self, batch: Mapping[str, Any]) -> dict[str, float]:
+        views, height, width = batch["image"].shape[1:4]
+        textured = int((batch["patch_index"] >= 0).sum()) if "patch_index" in batch else 0
+        return forward_flops(self.config, batch["mask"].sum(axis=1).tolist(), views, height, width, textured)
+
+    def tokens(self, batch: Mapping[str, Any]) -> int:
+        views, height, width = batch["image"].shape[1:4]
+        rays = views * (height // self.config.patch_size) * (width // self.config.patch_size)
+        return int(batch["mask"].sum()) + len(batch["mask"]) * (self.config.num_register_tokens + rays)
+
+    def leak_gradient(self, share: float) -> None:
+        self.view_transformer.gradient_leak = share
 
     def _encode_material(self, scenes: Triangles) -> Tensor:
         """(T, d)."""
@@ -363,21 +389,6 @@ class RenderFormer(nn.Module):
     def layers(self) -> list[nn.Module]:
         """Every transformer layer of both stages: the units of compilation, recomputation and sharding."""
         return [*self.transformer.layers, *self.view_transformer.transformer.layers]
-
-    def compile_layers(self, backend: str = "inductor") -> None:
-        """``torch.compile`` for the layers, in place: a few small graphs for all of them, whatever the number of triangles."""
-        for layer in self.layers():
-            layer.compile(backend=backend)
-
-    def activation_checkpointing(self, on: bool = True) -> None:
-        """Keep only the layers' inputs for the backward pass and compute the rest again: same result, less memory."""
-        for layer in self.layers():
-            layer.recompute = on
-
-
-def autocast(device: str, on: bool) -> AbstractContextManager:
-    """bfloat16 for matrix products where ``on``."""
-    return torch.autocast(device, dtype=torch.bfloat16) if on else nullcontext()
 
 
 def to_radiance(y: Tensor) -> Tensor:

@@ -23,9 +23,10 @@ from torch import Tensor, nn
 from model.errors import InputError
 from model.lpips import LPIPS
 from model.renderformer import checkpoint
-from model.renderformer.flops import TRAINING, forward_flops, ideal_seconds, peak_flops
+from model.renderformer.base import Network
+from model.renderformer.flops import TRAINING, ideal_seconds, peak_flops
 from model.renderformer.losses import image_loss, log_radiance
-from model.renderformer.network import RenderFormer, to_radiance
+from model.renderformer.network import to_radiance
 from model.renderformer.recipe import FitConfig
 from model.training.logs import TrainingLog
 from model.training.optimization import Average, build_optimizers, schedule, set_learning_rate
@@ -39,15 +40,13 @@ Batch = Mapping[str, Any]
 Pair = tuple[np.ndarray, np.ndarray]  # a reference and a prediction, each (H, W, 3) radiance
 
 
-def predict(forward: Callable[..., Tensor], model: RenderFormer, batch: Batch, device: Any, precision: str) -> Tensor:
-    """(B, V, H, W, 3) log10(1 + radiance) for the batch's cameras, at its images' size."""
-    cameras = torch.from_numpy(np.ascontiguousarray(batch["camera_to_world"])).to(device, non_blocking=True)
-    fov = torch.from_numpy(np.ascontiguousarray(batch["fov_deg"])).to(device, non_blocking=True)
-    return forward(model.read(batch, device), cameras, fov, tuple(batch["image"].shape[2:4]), precision)
+def predict(forward: Callable[..., Tensor], model: Network, batch: Batch, device: Any, precision: str) -> Tensor:
+    """log10(1 + radiance) of the batch's images, in their shape."""
+    return forward(*model.arguments(batch, device), precision=precision)
 
 
 def evaluate(
-    model: RenderFormer, batches: Sequence[Batch], group: Group, precision: str = "fp32", pictures: int = 0
+    model: Network, batches: Sequence[Batch], group: Group, precision: str = "fp32", pictures: int = 0
 ) -> tuple[dict[str, float], list[Pair]]:
     """Means over all views: ``log_error`` (L1 of log10(1 + x)) and ``psnr`` of linear radiance clamped to [0, 1], in dB.
 
@@ -93,7 +92,7 @@ def parts(batch: Batch, most: int | None) -> Iterator[tuple[Batch, float, bool]]
 class Work:
     """Scenes, tokens and floating-point operations since the last log line, for rates and utilisation."""
 
-    def __init__(self, model: RenderFormer, group: Group, precision: str):
+    def __init__(self, model: Network, group: Group, precision: str):
         self.model, self.group, self.precision = model, group, precision
         self.peaks = {"float32": peak_flops(str(group.device), "float32")}
         if precision != "fp32":
@@ -106,15 +105,9 @@ class Work:
 
     def add(self, batch: Batch) -> None:
         """One training step; padding is not counted."""
-        config = self.model.config
-        triangles = batch["mask"].sum(axis=1).tolist()
-        views, height, width = batch["image"].shape[1:4]
-        rays = views * (height // config.patch_size) * (width // config.patch_size)
-        textured = int((batch["patch_index"] >= 0).sum()) if "patch_index" in batch else 0
-        self.scenes += len(triangles)
-        self.tokens += sum(triangles) + len(triangles) * (config.num_register_tokens + rays)
-        flops = forward_flops(config, triangles, views, height, width, textured)
-        self.ideal += TRAINING * ideal_seconds(flops, self.peaks, self.precision)
+        self.scenes += len(batch["mask"])
+        self.tokens += self.model.tokens(batch)
+        self.ideal += TRAINING * ideal_seconds(self.model.flops(batch), self.peaks, self.precision)
 
     def rates(self) -> dict[str, float]:
         """Over all processes, which do equal work; ``mfu``: time at the rate of a large matrix product, over elapsed time.
@@ -145,7 +138,7 @@ class _State:
 
     PLAIN = ("step", "skipped", "skipped_in_a_row", "seconds", "window", "best")
 
-    def __init__(self, model: RenderFormer, config: FitConfig, folder: Path, group: Group):
+    def __init__(self, model: Network, config: FitConfig, folder: Path, group: Group):
         self.model, self.config, self.path, self.group = model, config, folder / STATE, group
         self.optimizers = build_optimizers(model, config.optimizer, config.lr, config.muon_lr, config.weight_decay)
         self.average = Average(model, config.ema) if config.ema else None
@@ -213,7 +206,7 @@ class _State:
 
 
 def fit(
-    model: RenderFormer,
+    model: Network,
     config: FitConfig,
     batches: Callable[[int, int], Iterable[Batch]],
     validation: Sequence[Batch],
@@ -227,15 +220,14 @@ def fit(
     """Train ``model`` in place up to ``config.steps``, going on from ``folder`` if it holds a state.
 
     ``batches(start, stop)`` yields the batches of those steps, each a pure function of its step and this process's slice of the
-    global batch: dicts of numpy arrays as ``model.renderformer.inputs.scenes_of`` reads them, with camera_to_world (B, V, 4,
-    4), fov_deg (B, V) and image (B, V, H, W, 3) radiance. ``validation`` is a fixed list of such; ``show`` makes a picture of
-    some views. ``trained_with`` goes into the checkpoints. Returns steps, skipped, seconds, and the last and best
-    validation's metrics.
+    global batch: dicts of numpy arrays that ``model.arguments`` reads, with image (B, V, H, W, 3) radiance. ``validation`` is
+    a fixed list of such; ``show`` makes a picture of some views. ``trained_with`` goes into the checkpoints. Returns steps,
+    skipped, seconds, and the last and best validation's metrics.
     """
     precision = config.precision_on(group.device.type)
     folder.mkdir(parents=True, exist_ok=True)
     model.to(group.device).train()
-    model.view_transformer.gradient_leak = config.gradient_leak
+    model.leak_gradient(config.gradient_leak)
     model.activation_checkpointing(config.activation_checkpointing)
     if precision != "fp32" and group.device.type == "cuda":
         torch.set_float32_matmul_precision("high")

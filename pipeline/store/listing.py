@@ -95,6 +95,10 @@ class Listing(Sequence[Row]):
     def holds(self, record_id: str) -> bool:
         return record_id in self._lines[1]
 
+    def number(self, record_id: str) -> int:
+        """The place of the record in the order of the file; KeyError if there is none."""
+        return self._lines[1][record_id]
+
     def digest(self, record_id: str) -> str:
         """The record's digest, without reading its row; KeyError if there is none."""
         start = self._lines[1][record_id] * _DIGEST_BYTES

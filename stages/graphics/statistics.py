@@ -28,6 +28,7 @@ METHODS: Mapping[str, str] = {
     "mean_image": "mean training image",
     "constant": "best constant colour per scene (oracle)",
     "direct": "direct light only (reference)",
+    "closed_form": "closed form alone, nothing learned",  # only of models that start from one
 }
 BARS = ("mean_image", "constant")  # what the model has to beat ...
 JUDGED = ("psnr", "log_error")  # ... in these metrics
@@ -145,7 +146,7 @@ def _breakdown(scenes: Sequence[Scene], key: str, metrics: Mapping[str, Metric])
     for value in sorted(bins, key=breakdown.order):
         some = [{"views": views} for views in bins[value].values()]
         row: dict[str, Any] = {"value": value, "scenes": len(some), "views": sum(len(scene["views"]) for scene in some)}
-        for method in METHODS:
+        for method in methods_of(scenes):
             row[method] = {name: float(np.mean(np.concatenate(_column(some, method, name)))) for name in metrics}
         model = {name: bootstrap(_column(some, "model", name), metric.bounds) for name, metric in metrics.items()}
         row["interval"] = {n: None if value["low"] is None else [value["low"], value["high"]] for n, value in model.items()}
@@ -153,12 +154,19 @@ def _breakdown(scenes: Sequence[Scene], key: str, metrics: Mapping[str, Metric])
     return out
 
 
+def methods_of(scenes: Sequence[Scene]) -> list[str]:
+    """The methods that the scenes' views were scored with."""
+    scored = scenes[0]["views"][0]["scores"]
+    return [method for method in METHODS if method in scored]
+
+
 def summarise(scenes: Sequence[Scene], metrics: Mapping[str, Metric] = METRICS) -> dict[str, Any]:
     """Everything that the report says of one run in numbers, as plain JSON."""
-    columns = {method: {name: _column(scenes, method, name) for name in metrics} for method in METHODS}
+    methods = methods_of(scenes)
+    columns = {method: {name: _column(scenes, method, name) for name in metrics} for method in methods}
     gains = {
         other: {name: _gain(metric, columns["model"][name], columns[other][name]) for name, metric in metrics.items()}
-        for other in METHODS
+        for other in methods
         if other != "model"
     }
     return {

@@ -1,8 +1,8 @@
-"""Frames to an MP4 that plays anywhere: H.264 in yuv420p, by PyAV (FFmpeg's libraries)."""
+"""Frames to an MP4 that plays anywhere, H.264 in yuv420p, and frames of anybody's video, by PyAV (FFmpeg's libraries)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -43,3 +43,26 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = 24) -> int:
     except (av.error.FFmpegError, OSError) as error:
         raise UserError(f"{path} cannot be written ({error}): give a file in an existing folder") from error
     return count
+
+
+def frame_count(path: Path) -> int:
+    """How many frames the video at ``path`` has, without decoding them; raises UserError."""
+    import av
+
+    try:
+        with av.open(str(path)) as file:
+            return sum(packet.size > 0 for packet in file.demux(file.streams.video[0]))
+    except (av.error.FFmpegError, IndexError) as error:
+        raise UserError(f"{str(path)!r} is no video that can be read: {error}") from None
+
+
+def read_video(path: Path) -> Iterator[np.ndarray]:
+    """(H, W, 3) uint8 frames of the video at ``path``, upright as a player shows them; raises UserError."""
+    import av
+
+    try:
+        with av.open(str(path)) as file:
+            for frame in file.decode(file.streams.video[0]):
+                yield np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90) % 4)
+    except (av.error.FFmpegError, IndexError) as error:
+        raise UserError(f"{str(path)!r} is no video that can be read: {error}") from None

@@ -14,6 +14,7 @@ SYSTEM = System(
     },
     targets={"data": ("atlas",), "train": ("fit",), "eval": ("evaluate",)},
     commands="stages.neuras.commands:add_commands",
+    views="stages.neuras.viewing:VIEWS",
     packages=(
         "lightmill",
         "torch",

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from pipeline.config import StageConfig, runtime
+from pipeline.config import StageConfig, added, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.graphics.arrays import pack_json
 from stages.neuras.captures.sources import FolderConfig, FolderSource, Source
+from stages.neuras.captures.splits import RuleName
 from stages.neuras.records import POINTS, FrameRecord, frames, point_sets, save
 from stages.neuras.street.settings import StreetConfig
 
@@ -52,14 +54,39 @@ class PandasetConfig(FolderConfig):
 
     name: Literal["pandaset"] = "pandaset"
     cameras: list[str] = Field(["front_camera"], min_length=1)  # folders below camera/
+    mask_actors: bool = added(True, legacy=False)  # what moves does not count, and its points go
+
+
+class BlendedMVSConfig(FolderConfig):
+    """A scene of BlendedMVS in its own layout, or one of MVSNet's."""
+
+    name: Literal["blendedmvs"] = "blendedmvs"
+    split: RuleName = "random_half"  # as the paper's table 2
+
+
+class NerfSyntheticConfig(FolderConfig):
+    """An object of NeRF's synthetic set in its own layout."""
+
+    name: Literal["nerf_synthetic"] = "nerf_synthetic"
+
+
+class ImagesConfig(FolderConfig):
+    """Photos in a folder, or a video, without poses: pycolmap finds them."""
+
+    name: Literal["images"] = "images"
+    video_frames: int = Field(80, ge=3)  # a video is cut into so many, the sharpest of each stretch
+    sfm_side: int = Field(
+        1000, ge=100
+    )  # longest side of the pictures that features are looked for in; pictures stay as they are
+
+
+FOLDERS = NerfstudioConfig | ColmapConfig | PandasetConfig | BlendedMVSConfig | NerfSyntheticConfig | ImagesConfig
 
 
 class Capture(MapStage):
     name: ClassVar[str] = "capture"
     version: ClassVar[int] = 3
-    Config: ClassVar[Any] = Annotated[
-        StreetCaptureConfig | NerfstudioConfig | ColmapConfig | PandasetConfig, Field(discriminator="name")
-    ]
+    Config: ClassVar[Any] = Annotated[StreetCaptureConfig | FOLDERS, Field(discriminator="name")]
     reasons: ClassVar[dict[str, str]] = {
         "no_pose": "the frame has no camera pose, or one of another shape",
         "left_handed": "the axes of its pose are mirrored",
@@ -107,18 +134,22 @@ class Capture(MapStage):
         return [Item(id, group) for id, group in _source(config).items()]
 
     def prepare(self, config: StageConfig, inputs: Inputs, folder: Path) -> None:
-        """The made-up place, which all workers look at."""
+        """The made-up place, or the poses of images that have none: all workers look at it."""
         if isinstance(config, StreetCaptureConfig):
             from stages.neuras.street import source
 
             source.prepare(config, folder)
+        if isinstance(config, ImagesConfig):
+            from stages.neuras.captures import images
+
+            images.prepare(config, images.root_of(config.path), folder)
 
     def open(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any]) -> Source:
         return _source(config)
 
     def open_prepared(self, config: StageConfig, inputs: Inputs, environment: dict[str, Any], folder: Path) -> Source:
         if not isinstance(config, StreetCaptureConfig):
-            return self.open(config, inputs, environment)
+            return _source(config, folder)
         from stages.graphics.mitsuba import backend
         from stages.neuras.street.source import StreetSource
 
@@ -130,9 +161,12 @@ class Capture(MapStage):
         yield record.to_record()
 
     def finish(self, config: StageConfig, inputs: Inputs, draft: Draft) -> None:
-        from stages.neuras.captures import sheet
+        from stages.neuras.captures import sanity, sheet
 
-        source = _source(config)
+        if isinstance(config, ImagesConfig):
+            draft.prepared.mkdir(exist_ok=True)
+            self.prepare(config, inputs, draft.prepared)  # a run that took every frame over has not done it
+        source = _source(config, draft.prepared)
         info = source.info()
         (draft.files / "capture.json").write_bytes(pack_json(info.to_json()))
         mesh = source.mesh()
@@ -143,6 +177,9 @@ class Capture(MapStage):
         shown = [FrameRecord.from_record(draft.read(views[index].id)) for index in sheet.chosen(len(views))]
         (draft.files / "contact.png").write_bytes(sheet.drawn(views, shown, place))
         draft.note("summary", sheet.summary(views, place))
+        training = [view for view in views if view.split == "train"]
+        if training and isinstance(source, FolderSource):
+            sanity.check(training, place.surface(), lambda id: FrameRecord.from_record(draft.read(id)))
         if info.units == "arbitrary":
             nominal = f"a hundredth of the capture's radius, {info.metre:.4g}, stands for a metre"
             draft.log(f"unit unknown ({info.source['units_from']}): {nominal}. If the set is in metres: capture.units=metre")
@@ -152,12 +189,20 @@ class Capture(MapStage):
             raise UserError("no training frame is left: see the rejected frames' reasons above")
 
 
-def _source(config: StageConfig) -> Source:
-    from stages.neuras.captures import colmap, nerfstudio, pandaset
+def _source(config: StageConfig, prepared: Path | None = None) -> Source:
+    """The capture. prepared: the folder that ``prepare`` wrote to; without it images without poses have none."""
+    from stages.neuras.captures import blendedmvs, colmap, images, nerf_synthetic, nerfstudio, pandaset
     from stages.neuras.street.source import StreetSource
 
     if isinstance(config, StreetCaptureConfig):
         return StreetSource(config)
-
-    readers = {"nerfstudio": nerfstudio.read, "colmap": colmap.read, "pandaset": pandaset.read}
+    if isinstance(config, ImagesConfig):
+        return FolderSource(config, partial(images.read, prepared=prepared), images.root_of(config.path))
+    readers = {
+        "nerfstudio": nerfstudio.read,
+        "colmap": colmap.read,
+        "pandaset": pandaset.read,
+        "blendedmvs": blendedmvs.read,
+        "nerf_synthetic": nerf_synthetic.read,
+    }
     return FolderSource(config, readers[config.name])

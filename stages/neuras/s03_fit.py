@@ -64,6 +64,7 @@ class FitStageConfig(StageConfig):
     block: int = Field(4, ge=2)  # texels along the finest cell of a skybox
     near_opacity: float = Field(0.12, gt=0, lt=1)  # of all skyboxes but the farthest, at the start
     direction_noise: float = Field(0.0, ge=0)  # sigma added to the view direction
+    exposure: bool = added(False, legacy=False)  # an affine change of colour per training image
     # Runtime
     device: str = runtime("auto")  # auto | cpu | cuda
     threads: int | None = runtime(1, ge=1)  # CPU threads; null: torch's choice
@@ -125,7 +126,7 @@ class Fit(RunStage):
         import torch
 
         from model.neuras.fitting import Outputs, fit
-        from stages.neuras.rasterizing.casting import Caster
+        from stages.graphics.casting import Caster
         from stages.neuras.records import CaptureInfo, frames, load_atlas
 
         if config.threads is not None:

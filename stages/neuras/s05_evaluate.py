@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from pipeline.config import StageConfig, report, runtime
+from pipeline.config import StageConfig, added, report, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 
@@ -30,6 +30,7 @@ class EvaluateConfig(StageConfig):
     splits: tuple[Literal["validation", "test", "shift"], ...] = Field(("test", "shift"), min_length=1)
     warping_views: int = Field(4, ge=1)  # nearest photos that warping takes for a view
     depth_tolerance: float = Field(0.05, gt=0)  # of the mesh, relative to the true depth
+    exposure: Literal["none", "half"] = added("none", legacy="none")  # half: found on the left half, scored on the right
     lpips: Literal["none", "vgg", "alex"] = "none"
     lpips_folder: str | None = runtime(None)  # where its weights lie; None: see model.weights
     inception: bool = report(False)  # FID and KID beside the drive
@@ -104,6 +105,7 @@ class Evaluate(MapStage):
             warping(capture, reference, scene.info.radius, config.warping_views),
             scorers(config.lpips, config.lpips_folder),
             config.depth_tolerance,
+            config.exposure == "half",
         )
         return examiner, capture
 

@@ -108,22 +108,69 @@ def command_export(arguments: argparse.Namespace) -> int:
 
 
 def command_sweep(arguments: argparse.Namespace) -> int:
-    from stages.renderformer.evaluation.ablation import sweep
+    from stages.renderformer.evaluation import ablation, comparison
 
-    return sweep(arguments.table, arguments.rows, arguments.words, Path(arguments.out or f"runs/{arguments.table}"))
+    out = Path(arguments.out or f"runs/{arguments.table}")
+    if arguments.table in ablation.tables():
+        return ablation.sweep(arguments.table, arguments.rows, arguments.words, out)
+    return comparison.sweep(arguments.table, arguments.rows, arguments.words, out, arguments.until)
 
 
 def command_table(arguments: argparse.Namespace) -> int:
-    from stages.renderformer.evaluation.ablation import write_table
+    from stages.renderformer.evaluation import ablation, comparison
 
-    return write_table(arguments.table, arguments.rows, arguments.words, Path(arguments.out or f"runs/{arguments.table}"))
+    out = Path(arguments.out or f"runs/{arguments.table}")
+    write = ablation.write_table if arguments.table in ablation.tables() else comparison.write_page
+    return write(arguments.table, arguments.rows, arguments.words, out)
 
 
 def command_import(arguments: argparse.Namespace) -> int:
     from pipeline.__main__ import main as run_main
 
-    words = ["stage=scene", "scene=imported", f"scene.path={json.dumps(arguments.folder)}", *arguments.words]
+    if arguments.out is not None or Path(arguments.source).is_file():
+        return import_file(arguments)
+    words = ["stage=scene", "scene=imported", f"scene.path={json.dumps(arguments.source)}", *arguments.words]
     return run_main([*words, *(["--debug"] if arguments.debug else [])])
+
+
+def import_file(arguments: argparse.Namespace) -> int:
+    """``lightmill import SCENE -o OUT``: a scene of a modelling tool as one in a released format."""
+    from stages.renderformer.importing.convert import ImportSettings, import_scene
+    from stages.renderformer.importing.write import check_out, write_scene
+    from stages.renderformer.inference.limits import beyond_limits, resolution_limit
+
+    source = Path(arguments.source)
+    if arguments.words:
+        raise UserError(f"unknown arguments: {' '.join(arguments.words)}; settings follow a folder, not a file")
+    if arguments.out is None:
+        raise UserError(f"{source} is a file: give -o OUT.json or -o OUT.h5, or a folder of scenes in a released format")
+    if not source.is_file():
+        raise UserError(f"{source} is not a file: give a scene that a modelling tool exported, such as scene.glb")
+    out = Path(arguments.out)
+    check_out(out)
+    scene = import_scene(source, ImportSettings(arguments.triangles, arguments.exposure))
+    for note in [*scene.meta["notes"], *write_scene(out, scene)]:
+        print(f"note: {note}")
+    views = range(len(scene.fov_deg))
+    for sentence in beyond_limits(scene, views, (resolution_limit({}),) * 2, {}):
+        print(f"beyond the training data: {sentence}")
+    print(out)
+    return 0
+
+
+def command_publish(arguments: argparse.Namespace) -> int:
+    from stages.renderformer.hub import publication, publish
+
+    what = publication(arguments.artifact, arguments.name, arguments.store, arguments.license)
+    files = list(what.listing())
+    for path, size in files:
+        print(f"{size:>14,}  {path}")
+    print(f"{sum(size for _, size in files):>14,}  bytes in {len(files):,} files, for the {what.kind} {what.name}")
+    if arguments.dry_run:
+        print("\n" + what.files["README.md"].decode().split("\n---\n")[0] + "\n---\nnothing was uploaded (--dry-run)")
+    else:
+        print(publish(what, arguments.private))
+    return 0
 
 
 def command_report(arguments: argparse.Namespace) -> int:
@@ -191,14 +238,23 @@ def add_commands(parsers: Any, program: str) -> None:
     sub.add_argument("--store", default="store", help="the store's folder (default: store)")
 
     sub = add(
-        "import", command_import, "released JSON and HDF5 scenes as scenes to render (then: stage=render scene=imported ..)",
-        "scenes scene.split=test",
+        "import", command_import,
+        "a scene of a modelling tool (glTF, USD) as a scene file, or a folder of scene files as scenes to render",
+        f"scene.glb -o scene.h5   |   {program} import scenes scene.split=test   (then: stage=render scene=imported ..)",
     )  # fmt: skip
-    sub.add_argument("folder", help="folder of scene files; train/, validation/ and test/ in it are splits")
-    sub.usage = f"{program} import FOLDER [name=value ...] [--debug]"
+    sub.add_argument("source", metavar="SCENE | FOLDER",
+                     help="a .glb, .gltf or .usd*; or a folder of released JSON and HDF5 scenes: train/, validation/ and test/ "
+                     "in it are splits")  # fmt: skip
+    sub.add_argument("-o", "--out", help="of a scene: OUT.json (its meshes in OUT-meshes/) or OUT.h5")
+    sub.add_argument("--triangles", type=int, metavar="N", default=4096,
+                     help="of a scene: decimate it to N in all, or subdivide what is large (default: 4096)")  # fmt: skip
+    sub.add_argument("--exposure", type=exposure_argument, default=1.0, metavar="STOPS",
+                     help="of a scene: of all light, or 'auto': as bright as the training data (default: 0)")  # fmt: skip
+    of_scene, of_folder = "SCENE -o OUT [--triangles N] [--exposure STOPS]", "FOLDER [name=value ...] [--debug]"
+    sub.usage = f"{program} import {of_scene}  |  {program} import {of_folder}"
 
     for name, function, summary in (
-        ("sweep", command_sweep, "train and evaluate the rows of the paper's table 1, then write the table"),
+        ("sweep", command_sweep, "train and evaluate the rows of a table (the paper's table 1, priors), then write it"),
         ("table", command_table, "write the table of the rows that the store holds"),
     ):
         sub = add(name, function, summary, "table1_small --rows full,no_dpt jobs=2")
@@ -206,10 +262,14 @@ def add_commands(parsers: Any, program: str) -> None:
             "table", nargs="?", default="table1_small", help="folder of conf/renderformer/experiment (default: table1_small)"
         )
         sub.add_argument("--rows", type=lambda text: text.split(","), help="some rows, comma-separated (default: all)")
-        sub.add_argument("-o", "--out", help="folder of table.md, table.json and table.png (default: runs/TABLE)")
+        sub.add_argument("-o", "--out", help="folder of what is written: table.* or report.* (default: runs/TABLE)")
+        if name == "sweep":
+            sub.add_argument("--until", choices=("train", "evaluate"), default="evaluate", help="stop after this stage")
         sub.usage = f"{program} {name} [TABLE] [--rows ROW,...] [-o FOLDER] [name=value ...] [--debug]"
 
-    scene_help = "scene file in a released format (.json, .h5), or a mesh (.glb, .gltf, .obj, .off, .ply, .stl)"
+    scene_help = (
+        "scene file in a released format (.json, .h5), or a mesh or scene (.glb, .gltf, .usd*, .obj, .off, .ply, .stl, ..)"
+    )
 
     def add_mesh_options(sub: argparse.ArgumentParser, triangles: str) -> None:
         group = sub.add_argument_group("a mesh gets a room, lights and a camera")
@@ -221,7 +281,8 @@ def add_commands(parsers: Any, program: str) -> None:
     def add_model_options(sub: argparse.ArgumentParser) -> None:
         sub.add_argument(
             "--checkpoint",
-            help="released-format folder, or a train artifact's key, name or 'train' (default: the model that ships)",
+            help="released-format folder, hub:OWNER/NAME, or a train artifact's key, name or 'train' (default: the model that "
+            "ships)",
         )
         sub.add_argument("--composite-lights", action="store_true", help="one pass per light, summed: for many lights")
         sub.add_argument("--device", default="auto", help="cpu, cuda or auto (default)")
@@ -230,7 +291,8 @@ def add_commands(parsers: Any, program: str) -> None:
     sub = add("trace", command_trace, "path trace a scene or mesh file", "scene.json -o out.exr --spp 256")
     sub.add_argument("scene", help=scene_help)
     sub.add_argument("-o", "--out", required=True, help="output .exr (linear RGB float); with --view all: OUT-0.exr, OUT-1.exr")
-    sub.add_argument("--resolution", type=int, default=512, help="pixels per side (default: 512)")
+    sub.add_argument("--resolution", type=resolution_argument, metavar="N", default=512,
+                     help="pixels of the longer side, or WIDTHxHEIGHT (default: 512)")  # fmt: skip
     sub.add_argument("--spp", type=int, default=256, help="samples per pixel (default: 256)")
     sub.add_argument("--mode", choices=("physical", "cycles"), default="physical", help="what the renderer matches")
     sub.add_argument("--denoise", action=argparse.BooleanOptionalAction, default=True, help="Open Image Denoise (default: on)")
@@ -249,7 +311,7 @@ def add_commands(parsers: Any, program: str) -> None:
         "-o", "--out", required=True, help="output .exr (linear), .png, or .mp4 (its frames as PNGs in a folder of that name)"
     )
     sub.add_argument("--resolution", type=resolution_argument, metavar="N",
-                     help="pixels per side, divisible by 8, or WIDTHxHEIGHT (default: as it was trained)")  # fmt: skip
+                     help="pixels of the longer side, by eights, or WIDTHxHEIGHT (default: as it was trained)")  # fmt: skip
     sub.add_argument("--view", type=view_argument, default=0, help="camera number, or 'all' (default: 0)")
     sub.add_argument("--orbit", type=int, metavar="FRAMES", help="so many frames around the scene, starting at --view")
     sub.add_argument("--arc", type=float, metavar="DEGREES", help="of the orbit (default: all around, or what walls allow)")
@@ -272,11 +334,25 @@ def add_commands(parsers: Any, program: str) -> None:
     sub.add_argument("--lpips", choices=("none", "vgg", "alex"), default="none", help="LPIPS as well, by that network")
     sub.add_argument("--lpips-folder", metavar="FOLDER", help="where its published weights lie")
     group = sub.add_argument_group("of a scene")
-    group.add_argument("--resolution", type=int, metavar="N", help="pixels per side (default: as the checkpoint was trained)")
+    group.add_argument("--resolution", type=resolution_argument, metavar="N",
+                       help="pixels of the longer side, or WIDTHxHEIGHT (default: as the checkpoint was trained)")  # fmt: skip
     group.add_argument("--view", type=int, default=0, help="camera number (default: 0)")
     group.add_argument("--spp", type=int, default=256, help="samples per pixel of the reference (default: 256)")
     add_model_options(sub)
     add_mesh_options(sub, "as the checkpoint was trained")
+
+    sub = add(
+        "publish", command_publish, "upload a dataset or a checkpoint to Hugging Face's hub (by the package huggingface_hub)",
+        "shard hub:OWNER/NAME --dry-run",
+    )  # fmt: skip
+    sub.add_argument(
+        "artifact", help="key or name of an artifact of shard or train, 'shard', 'train', or a checkpoint's folder"
+    )
+    sub.add_argument("name", metavar="hub:OWNER/NAME", help="the repository; it is made where it does not exist")
+    sub.add_argument("--dry-run", action="store_true", help="list the files and the card's header, and upload nothing")
+    sub.add_argument("--private", action="store_true", help="a new repository is seen by its owner alone")
+    sub.add_argument("--license", metavar="ID", help="the hub's identifier (default: a dataset's that of its objects, if one)")
+    sub.add_argument("--store", default="store", help="the store's folder (default: store)")
 
     sub = add(
         "report", command_report, "runs side by side, and probes, on one HTML page (with JSON and Markdown beside it)",

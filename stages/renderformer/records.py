@@ -44,7 +44,8 @@ class SceneRecord:
     light_index: (F,) int16, -1 where a triangle does not emit, else the light (0..L-1) that it belongs to.
     object_index: (F,) int16 into ``meta["objects"]`` (walls, objects and lights).
     camera_to_world: (V, 4, 4) float32. fov_deg: (V,) float32, full angle of the square image.
-    meta: JSON. ``template``, ``law``, ``split``, ``objects`` [{name, kind: wall|object|light, object_id?, faces}].
+    meta: JSON. ``template``, ``law``, ``split``, ``objects`` [{name, kind: wall|object|light, object_id?, faces}]. ``aspect``:
+        width over height of each camera's picture, where one is not square; ``fov_deg`` is across the height.
     patch_index: (F,) int32, the row of ``patches`` that a textured triangle reads, -1 where a triangle is constant; None in
         scenes without textures.
     patches: (T, 7, 32, 32) float16, channels 0..6 of PATCH_CHANNELS (diffuse, specular, roughness) as right-triangle patches;
@@ -92,6 +93,13 @@ class SceneRecord:
     def n_lights(self) -> int:
         """L, the number of lights."""
         return int(self.light_index.max(initial=-1)) + 1
+
+    def picture_size(self, view: int, side: int, multiple: int = 1) -> tuple[int, int]:
+        """(height, width) of a camera's picture whose longer side has ``side`` pixels; the other is one of ``multiple``."""
+        aspect = self.meta.get("aspect", {view: 1.0})[view]
+        shorter = side * min(aspect, 1 / aspect)
+        shorter = side if abs(aspect - 1) < 1e-3 else min(max(round(shorter / multiple), 1) * multiple, side)
+        return (shorter, side) if aspect > 1 else (side, shorter)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What ``scene.npz`` holds; the patches only where a triangle reads one."""

@@ -69,18 +69,21 @@ class ObjaverseConfig(CollectConfig):
 
 class Collect(MapStage):
     name: ClassVar[str] = "collect"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     Config: ClassVar[Any] = Annotated[ProceduralConfig | FolderConfig | ObjaverseConfig, Field(discriminator="name")]
     reasons: ClassVar[dict[str, str]] = {
         "unreadable": "the file is truncated, malformed or not what its suffix says",
         "unsupported": "the file requires a feature that is not supported",
         "needs_draco": "the file requires Draco compression and the package DracoPy is not installed",
+        "needs_package": "the file's format is read by a package that is not installed",
         "unsafe_path": "the file refers to, or is, something outside its folder",
         "too_large": "the file, or the geometry that it states, is over the configured limits",
         "no_faces": "there is no triangle in it",
         "not_finite": "a vertex in use is infinite or not a number",
         "bad_indices": "a face refers to a vertex that does not exist",
-        "degenerate": "no area, or an extent that is not sane",
+        "degenerate": "no area, or too small or too far from the origin for its numbers",
+        "too_large_extent": "coordinates so large that lengths and areas cannot be computed",
+        "too_thin": "a hair or a sliver: next to no area for its length",
         "unavailable": "the source does not have an object of that id",
         "duplicate": "the same geometry as another object",
     }
@@ -259,52 +262,50 @@ def _folder(config: FolderConfig) -> Path:
 
 def mesh_files(config: FolderConfig) -> list[str]:
     """Relative POSIX paths of the mesh files below the folder, sorted. Linked folders are not entered."""
-    from stages.graphics.geometry.load import SUFFIXES
+    from stages.graphics.geometry.load import EXPORTS, SUFFIXES
 
     root = _folder(config)
-    mesh_paths = []
+    mesh_paths, exports = [], set()
     for folder, folders, files in os.walk(root):
         folders.sort()
         for name in files:
             relative = (Path(folder) / name).relative_to(root)
+            exports |= {relative.suffix.lower()} & EXPORTS.keys()
             if relative.suffix.lower() in SUFFIXES and (
                 config.pattern == "**/*" or PurePosixPath(relative.as_posix()).match(config.pattern)
             ):
                 mesh_paths.append(relative.as_posix())
     if not mesh_paths:
-        raise UserError(f"collect.path={config.path!r} holds no mesh matching {config.pattern!r} ({', '.join(SUFFIXES)})")
+        hints = "".join(f"; {suffix} is not read: {EXPORTS[suffix]}" for suffix in sorted(exports))
+        raise UserError(
+            f"collect.path={config.path!r} holds no mesh matching {config.pattern!r} ({', '.join(SUFFIXES)}){hints}"
+        )
     return sorted(mesh_paths)
 
 
 def _hashes(config: FolderConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
     """Content of all that decides the output: per mesh file its hash and those of the buffers, and with textures of
     the libraries and images, that it names; the README."""
-    from stages.graphics.geometry import load
+    from stages.graphics.geometry import side_files
+    from stages.graphics.geometry.paths import inside
 
     root = _folder(config)
 
     def content(relative: str) -> str:
-        return hash_file(root / relative) if load.inside(root / relative, root) else "outside"
+        return hash_file(root / relative) if inside(root / relative, root) else "outside"
 
     items: dict[str, Any] = {}
     for relative in mesh_files(config):
         path = root / relative
-        buffers = {}
-        if config.textures and load.inside(path, root):
-            from stages.graphics.geometry.colours import side_files
-
-            names = [target.resolve().relative_to(root.resolve()).as_posix() for target in side_files(path, root)]
-            buffers = {name: content(name) for name in names}
-        if path.suffix.lower() == ".gltf" and load.inside(path, root):
-            for uri in load.buffer_files(path):
-                try:
-                    target = load.check_path(uri, path.parent, root)
-                except Reject:
-                    continue  # the file that names it is rejected when it is read
-                if target.suffix.lower() == load.BUFFER_SUFFIX and target.is_file():
-                    name = target.resolve().relative_to(root.resolve()).as_posix()
-                    buffers[name] = content(name)
-        items[relative] = [content(relative), buffers] if buffers else content(relative)
+        beside: list[Path] = []
+        if inside(path, root):
+            beside = (
+                side_files.buffers(path, root)
+                + side_files.layers(path, root)
+                + (side_files.colours(path, root) if config.textures else [])
+            )
+        names = [target.resolve().relative_to(root.resolve()).as_posix() for target in beside]
+        items[relative] = [content(relative), {name: content(name) for name in names}] if names else content(relative)
     return {"items": items, "readme": content("README.md") if (root / "README.md").is_file() else None}
 
 

@@ -34,7 +34,7 @@ class ImportConfig(StageConfig):
 
 class ImportScene(MapStage):
     name = "scene"
-    version = 1
+    version = 2
     inputs = ()
     Config = ImportConfig
     reasons = {

@@ -1,9 +1,10 @@
 """shard: scenes and their images as the dataset: webdataset tars, an index and a card.
 
 Reads *scene* and *render*, writes one sample per scene: ``scene.npz`` (compact, ``stages.renderformer.dataset.encoding``),
-``meta.json``, and ``view<i>.exr`` and ``view<i>.aov.exr`` for every kept view i, copied unchanged. One design choice: the
-store's parts *are* the shards, so that plain ``webdataset`` reads them where they lie and nothing is stored twice. Samples
-lie in order of id, which is a random order already: every scene is an independent draw. Paper section 3.3.
+``meta.json``, and ``view<i>.exr`` and ``view<i>.aov.exr`` for every kept view i, copied unchanged; with ``guides`` also what
+ray casting says of scene and views (``stages.renderformer.guides``). One design choice: the store's parts *are* the shards,
+so that plain ``webdataset`` reads them where they lie and nothing is stored twice. Samples lie in order of id, which is a
+random order already: every scene is an independent draw. Paper section 3.3.
 """
 
 from __future__ import annotations
@@ -13,18 +14,29 @@ import json
 import math
 import zlib
 from collections.abc import Iterable, Iterator
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from pipeline.config import StageConfig
+from pipeline.config import StageConfig, added
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.renderformer.views import VIEW, view_members
 
+if TYPE_CHECKING:
+    from stages.renderformer.records import SceneRecord
+
 
 class ShardConfig(StageConfig):
     shard_mb: float = Field(256.0, gt=0)  # size that shards come near: a power of two of scenes each
+    guides: bool = added(False, False)  # also hits, reflections and visibility by ray casting: what guided models read
+
+
+@dataclass(frozen=True)
+class Worker:
+    inputs: Inputs
+    guides: bool
 
 
 class Shard(MapStage):
@@ -35,7 +47,7 @@ class Shard(MapStage):
     Config = ShardConfig
 
     def slug(self, config: ShardConfig) -> str:
-        return f"{config.shard_mb:g}mb"
+        return f"{config.shard_mb:g}mb" + ("-guides" if config.guides else "")
 
     def part_size(self, config: ShardConfig, inputs: Inputs) -> int:
         """Scenes per shard: the power of two nearest to the target, by the mean bytes of a rendered scene.
@@ -50,11 +62,16 @@ class Shard(MapStage):
         for row in inputs["render"].rows():
             yield Item(row.id, row.group, (("scene", row.id), ("render", row.id)))
 
-    def open(self, config: ShardConfig, inputs: Inputs, environment: dict[str, Any]) -> Inputs:
-        return inputs
+    def open(self, config: ShardConfig, inputs: Inputs, environment: dict[str, Any]) -> Worker:
+        if config.guides and inputs["render"].manifest["preimage"]["params"].get("lights_visible"):
+            raise UserError(
+                "shard.guides=true: camera rays of guides pass through lights, but render.lights_visible=true shows them; "
+                "choose one of the two"
+            )
+        return Worker(inputs, config.guides)
 
-    def process(self, worker: Inputs, item: Item) -> Iterator[Record]:
-        yield merge(worker["scene"].read(item.id), worker["render"].read(item.id))
+    def process(self, worker: Worker, item: Item) -> Iterator[Record]:
+        yield merge(worker.inputs["scene"].read(item.id), worker.inputs["render"].read(item.id), worker.guides)
 
     def finish(self, config: ShardConfig, inputs: Inputs, draft: Any) -> None:
         """``files/``: ``index.jsonl``, ``shards.json``, ``objects.json``, and the card with its pictures."""
@@ -119,8 +136,8 @@ def note_objects(objects: dict[str, Any], meta: dict[str, Any]) -> None:
             objects.setdefault(entry["object_id"], {**origin, "scenes": 0})["scenes"] += 1
 
 
-def merge(scene: Record, render: Record) -> Record:
-    """One sample: the scene's arrays made compact, both metas, and the images byte for byte.
+def merge(scene: Record, render: Record, guides: bool = False) -> Record:
+    """One sample: the scene's arrays made compact, both metas, and the images byte for byte; the guides, where wanted.
 
     ``meta["views"]`` lists the camera index of each kept view in order, ``meta["render"]`` is what the renderer noted,
     ``meta["crc32"]`` maps each other member to the CRC-32 of its bytes.
@@ -134,17 +151,32 @@ def merge(scene: Record, render: Record) -> Record:
     record = SceneRecord.from_record(scene)
     members = {name: render.members[name] for index in views for name in view_members(index)}
     members = {"scene.npz": encode_scene(record), **members}
+    resolution = size_of(members[view_members(views[0])[0]])[0]
+    if guides:
+        members |= cast_guides(record, views, resolution)
     meta = {
         **record.meta,
         "n_triangles": len(record.triangles),
         "n_lights": record.n_lights,
         "views": views,
-        "resolution": size_of(members[view_members(views[0])[0]])[0],
+        "resolution": resolution,
         "render": unpack_json(render.members["meta.json"]),
         "crc32": {name: zlib.crc32(data) for name, data in members.items()},
     }
     plain = json.dumps(meta, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
     return Record(scene.id, {"meta.json": plain.encode(), **members})
+
+
+def cast_guides(scene: SceneRecord, views: Iterable[int], resolution: int) -> dict[str, bytes]:
+    """Members with the guides of the scene and of its views."""
+    from stages.renderformer.guides import GuideCaster, guide_member
+    from stages.renderformer.guides.records import SCENE_MEMBER, encode_scene_guides, encode_view_guides
+
+    caster = GuideCaster(scene)
+    members = {SCENE_MEMBER: encode_scene_guides(caster.scene_guides())}
+    for view in views:
+        members[guide_member(view)] = encode_view_guides(caster.view_guides(view, resolution, resolution))
+    return members
 
 
 def views_of(members: Iterable[str]) -> list[int]:

@@ -18,6 +18,7 @@ from pydantic import Discriminator, Tag
 from pipeline.config import StageConfig, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs
+from stages.renderformer import hub
 from stages.renderformer.s06_train import OBJECTS, Train, TrainConfig, check_objects
 
 FILES = ("config.json", "model.safetensors")
@@ -25,7 +26,9 @@ FILES = ("config.json", "model.safetensors")
 
 class GivenConfig(StageConfig):
     name: Literal["given"] = "given"
-    checkpoint: str | None = runtime(None)  # folder in the released format; what its files hold is part of the key
+    checkpoint: str | None = runtime(
+        None
+    )  # folder in the released format, or hub:OWNER/NAME; what its files hold is part of the key
 
 
 def _chosen(data: Any) -> str:
@@ -40,6 +43,10 @@ class TrainOrGiven(Train):
 
     def slug(self, config: Any) -> str:
         return "given" if isinstance(config, GivenConfig) else super().slug(config)
+
+    def agree(self, config: Any, configs: Mapping[str, StageConfig]) -> None:
+        if not isinstance(config, GivenConfig):
+            super().agree(config, configs)
 
     def identity(self, config: Any, hash_file: Callable[[Any], str]) -> dict[str, Any]:
         if not isinstance(config, GivenConfig):
@@ -71,7 +78,9 @@ def checkpoint_files(config: GivenConfig) -> list[Path]:
     """The files of the given checkpoint: config, weights, and the list of its training objects where it has one."""
     if config.checkpoint is None:
         raise UserError("train=given needs a checkpoint: train.checkpoint=FOLDER with config.json and model.safetensors")
-    files = [Path(config.checkpoint).expanduser() / name for name in FILES]
+    given = config.checkpoint
+    folder = hub.checkpoint(given) if hub.is_hub(given) else Path(given).expanduser()
+    files = [folder / name for name in FILES]
     for path in files:
         if not path.is_file():
             raise UserError(f"train.checkpoint={config.checkpoint!r} holds no {path.name}: give a released-format folder")

@@ -1,4 +1,4 @@
-"""Stage 6, train: the shards to a RenderFormer checkpoint (section 3.3).
+"""Stage 6, train: the shards to a checkpoint of a RenderFormer (section 3.3), or of a guided network.
 
 Reads the train and validation splits of *shard*; writes ``checkpoint/`` in the released format (the model after the last
 step: with a cosine to zero that is the one to use, and nothing is chosen by looking at validation), ``best/`` (the one with the
@@ -15,23 +15,25 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
-from pydantic import Field, create_model, model_validator
+from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
 from model.renderformer.config import FIXED, ModelConfig
+from model.renderformer.guided.config import GuideConfig, GuidedConfig
 from model.renderformer.recipe import FitConfig
 from model.training.threads import wait_briefly
 from pipeline.config import Section, StageConfig, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, RunStage
 from stages.graphics.device import choose_device
+from stages.renderformer import hub
 from stages.renderformer.dataset import BatchConfig
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from model.renderformer.network import RenderFormer
+    from model.renderformer.base import Network
     from model.training.parallel import Group
     from pipeline.store import Artifact, Draft
 
@@ -53,6 +55,17 @@ class NetworkSection(Section):
         """As the network's own config, which refuses what it cannot compute."""
         return ModelConfig(**self.model_dump(exclude={"name"}))
 
+    def unstartable(self, train: TrainConfig) -> str | None:
+        """Why these settings cannot train the network, if they cannot."""
+        if train.bundles_per_view:
+            return f"bundles_per_view={train.bundles_per_view}: {self.name} needs whole views; set train.bundles_per_view=0"
+        if train.informed_start is True and train.init_from is None and not (self.pe_type == "rope" and self.turn_to_cam_coord):
+            return (
+                f"informed_start=true aims rays by rotary positions in the camera frame, which {self.name} does not have: "
+                "set train.informed_start=inputs or false"
+            )
+        return None
+
 
 # The network: the fields of ModelConfig that have more than one supported value. They are stated there.
 ModelSection = create_model(
@@ -62,11 +75,60 @@ ModelSection = create_model(
     **{name: (kind, getattr(ModelConfig, name)) for name, kind in get_type_hints(ModelConfig).items() if name not in FIXED},
 )
 
+GuideSection = create_model(
+    "GuideSection",
+    __base__=Section,
+    __module__=__name__,
+    **{name: (kind, getattr(GuideConfig, name)) for name, kind in get_type_hints(GuideConfig).items()},
+)
+
+
+class GuidedNetworkSection(Section):
+    """What `GuidedSection` has besides the network's own fields."""
+
+    architecture: Literal["guided"] = "guided"
+    name: str = runtime("guided")
+    guide: GuideSection = GuideSection()
+
+    @model_validator(mode="after")
+    def _computable(self) -> GuidedNetworkSection:
+        self.build()
+        return self
+
+    def build(self) -> GuidedConfig:
+        fields = self.model_dump(exclude={"name", "architecture", "guide"})
+        return GuidedConfig(guide=GuideConfig(**self.guide.model_dump()), **fields)
+
+    def unstartable(self, train: TrainConfig) -> str | None:
+        if train.informed_start:
+            return (
+                f"informed_start={train.informed_start}: {self.name} starts from closed forms; set train.informed_start=false"
+            )
+        return None
+
+
+GuidedSection = create_model(
+    "GuidedSection",
+    __base__=GuidedNetworkSection,
+    __module__=__name__,
+    **{name: (kind, getattr(GuidedConfig, name)) for name, kind in get_type_hints(GuidedConfig).items() if name != "guide"},
+)
+
+
+def _architecture(data: Any) -> str:
+    name = data.get("architecture") if isinstance(data, dict) else getattr(data, "architecture", None)
+    return "renderformer" if name is None else str(name)
+
+
+Model = Annotated[
+    Annotated[ModelSection, Tag("renderformer")] | Annotated[GuidedSection, Tag("guided")], Discriminator(_architecture)
+]
+
 
 class TrainConfig(StageConfig, BatchConfig, FitConfig):
     """The data's and the loop's settings, which are stated with what reads them, and what binds the two."""
 
-    model: ModelSection = ModelSection()
+    model: Model = ModelSection()
     max_triangles: int | None = Field(None, ge=1)  # scenes with more are left out; null: none is
     init_from: str | None = runtime(None)  # checkpoint folder or train artifact to start from; its content counts, not its path
     # Initial values that say what is known (model.renderformer.initial), for runs of minutes.
@@ -84,14 +146,10 @@ class TrainConfig(StageConfig, BatchConfig, FitConfig):
 
     @model_validator(mode="after")
     def _startable(self) -> TrainConfig:
-        model = self.model
         if self.views_per_scene < 1:
             raise ValueError("views_per_scene=0 leaves nothing to learn from: give each scene at least one view")
-        if self.informed_start is True and self.init_from is None and not (model.pe_type == "rope" and model.turn_to_cam_coord):
-            raise ValueError(
-                f"informed_start=true aims rays by rotary positions in the camera frame, which {model.name} does not have: "
-                "set train.informed_start=inputs or false"
-            )
+        if problem := self.model.unstartable(self):
+            raise ValueError(problem)
         return self
 
 
@@ -103,6 +161,13 @@ class Train(RunStage):
 
     def slug(self, config: TrainConfig) -> str:
         return config.model.name
+
+    def agree(self, config: TrainConfig, configs: Mapping[str, StageConfig]) -> None:
+        """Weights that are missing are missed before anything runs."""
+        if config.lpips > 0:
+            from model.lpips import LPIPS
+
+            LPIPS.files(config.lpips_folder)
 
     def identity(self, config: TrainConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
         if config.init_from is None:
@@ -145,9 +210,9 @@ class Train(RunStage):
         """This process's part; ``files`` only for the one that leads."""
         import torch
 
-        from model.renderformer.network import RenderFormer
+        from model.renderformer.architectures import build
         from model.renderformer.training import fit
-        from stages.renderformer.dataset import Batches, ShardDataset, evaluation_samples, prefetch
+        from stages.renderformer.dataset import Batches, Needs, ShardDataset, evaluation_samples, prefetch
 
         if config.threads is not None:
             torch.set_num_threads(config.threads)
@@ -159,14 +224,18 @@ class Train(RunStage):
         validation = train
         if config.validate_on != "train":
             validation = ShardDataset(inputs["shard"], config.validate_on, config.max_triangles, skip_damaged_shards=skip)
-        batches = Batches(train, config, group.rank, group.world)
-        held_out = list(itertools.islice(evaluation_samples(validation), config.validation_scenes))
-
         if config.init_from is not None:
             check_objects(f"train.init_from={config.init_from}", initial_folder(config.init_from), inputs["shard"], say)
         torch.manual_seed(config.seed)
-        model = RenderFormer(config.model.build())
+        model = build(config.model.build())
         start(model, config)
+        if model.reads_guides and not train.guided:
+            raise UserError(
+                f"{config.model.name} reads guides, and the shards have none: set shard.guides=true, or choose another model"
+            )
+        needs = Needs(model.reads_guides, bundle=model.config.resolution_multiple)
+        batches = Batches(train, config, group.rank, group.world, needs)
+        held_out = list(itertools.islice(evaluation_samples(validation, model.reads_guides), config.validation_scenes))
         processes = f", {group.world} processes" if group.world > 1 else ""
         say(
             f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f}M parameters ({config.model.name}) on {group.device}, "
@@ -209,7 +278,7 @@ def name_damaged(
 
 def initial_folder(reference: str) -> Path:
     """The checkpoint folder that ``train.init_from`` names: itself, or inside a train artifact's folder."""
-    folder = Path(reference).expanduser()
+    folder = hub.checkpoint(reference) if hub.is_hub(reference) else Path(reference).expanduser()
     for candidate in (folder, folder / "files" / "checkpoint"):
         if (candidate / "config.json").is_file() and (candidate / "model.safetensors").is_file():
             return candidate
@@ -283,7 +352,7 @@ def check_objects(setting: str, folder: Path, shard: Artifact, say: Callable[[st
         )
 
 
-def start(model: RenderFormer, config: TrainConfig) -> None:
+def start(model: Network, config: TrainConfig) -> None:
     """Give the model its initial values: another run's, informed ones, or those of its layers."""
     if config.init_from is None:
         if config.informed_start:
@@ -295,7 +364,9 @@ def start(model: RenderFormer, config: TrainConfig) -> None:
 
     initial, _ = checkpoint.load(initial_folder(config.init_from))
     expected, actual = model.config.to_dict(), initial.config.to_dict()
-    different = [f"{name} {actual[name]} instead of {expected[name]}" for name in expected if expected[name] != actual[name]]
+    names = sorted(expected.keys() | actual.keys())
+    different = [f"{name} {actual.get(name)} instead of {expected.get(name)}" for name in names
+                 if expected.get(name) != actual.get(name)]  # fmt: skip
     if different:
         raise UserError(f"train.init_from={config.init_from} is another network: {', '.join(different)} (choose model=...)")
     model.load_state_dict(initial.state_dict())
@@ -338,12 +409,17 @@ def sizes(config: TrainConfig, configs: Mapping[str, StageConfig]) -> tuple[int 
 
 def cost(config: TrainConfig, configs: Mapping[str, StageConfig]) -> Cost | None:
     """With every scene as large as allowed; None where the data does not say how large that is."""
-    from model.renderformer.flops import TRAINING, forward_flops, ideal_seconds
+    from model.renderformer.architectures import architecture_of
+    from model.renderformer.flops import TRAINING, ideal_seconds
 
     side, largest = sizes(config, configs)
     if side is None or largest is None:
         return None
-    flops = forward_flops(config.model.build(), [largest], config.views_per_scene, side, side)
+    network = config.model.build()
+    flops = architecture_of(network).flops(network, [largest], config.views_per_scene, side, side)
+    if config.bundles_per_view:
+        share = min(1.0, config.bundles_per_view * network.resolution_multiple**2 / side**2)
+        flops = architecture_of(network).flops(network, [largest], config.views_per_scene, side, side * share)
     peaks = {name: value * 1e12 * UTILISATION for name, value in A100_TFLOPS.items()}
     scenes = TRAINING * config.batch_scenes * config.steps
     return Cost(scenes * sum(flops.values()), scenes * ideal_seconds(flops, peaks, config.precision) / 86400)
@@ -368,8 +444,9 @@ def estimate(config: TrainConfig, configs: Mapping[str, StageConfig]) -> list[st
     paid = cost(config, configs)
     if paid is None:
         return [*lines, "training: cost unknown, the data does not say its resolution or its triangles"]
-    rays = config.views_per_scene * (side // network.patch_size) ** 2
-    tokens = (largest + network.num_register_tokens + rays) * config.batch_scenes
+    bundles = (side // network.bundle_side) ** 2
+    rays = config.views_per_scene * min(bundles, config.bundles_per_view or bundles)
+    tokens = (largest + network.registers + rays) * config.batch_scenes
     return [
         *lines,
         f"training: {config.steps:,} steps of {config.batch_scenes} scenes x {config.views_per_scene} views, "

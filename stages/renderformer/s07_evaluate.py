@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -53,6 +53,7 @@ class Worker:
     config: EvaluateConfig
     device: str
     model: Any
+    closed_form: Any  # the model without what it learned; None where that is no picture
     shard: Artifact
     metrics: dict[str, Any]
     mean_images: dict[str, np.ndarray]  # per space, (H, W, 3)
@@ -64,6 +65,13 @@ class Evaluate(MapStage):
     version = VERSION
     inputs = ("shard", "train")
     Config = EvaluateConfig
+
+    def agree(self, config: EvaluateConfig, configs: Mapping[str, StageConfig]) -> None:
+        """Weights that are missing are missed before anything runs."""
+        if config.lpips != "none":
+            from model.lpips import LPIPS
+
+            LPIPS.files(config.lpips_folder, config.lpips)
 
     def slug(self, config: EvaluateConfig) -> str:
         return config.split
@@ -114,6 +122,7 @@ class Evaluate(MapStage):
         from stages.renderformer.dataset import decode_sample
         from stages.renderformer.evaluation.baselines import best_constants, measure_baseline
         from stages.renderformer.evaluation.ceiling import view_noise
+        from stages.renderformer.evaluation.regions import region_errors, region_map
         from stages.renderformer.inference.predict import predict_scene
 
         sample = decode_sample(worker.shard.read(item.id))
@@ -122,19 +131,23 @@ class Evaluate(MapStage):
         predictions = predict_scene(worker.model, scene, cameras, targets.shape[1], worker.device)
         if not np.isfinite(predictions).all():
             raise UserError(f"the model's prediction of scene {item.id} holds NaN or infinity: training has diverged")
+        closed_forms = None
+        if worker.closed_form is not None:
+            closed_forms = predict_scene(worker.closed_form, scene, cameras, targets.shape[1], worker.device)
         mean_image = measure_baseline(targets, worker.mean_images, worker.metrics)
         constant = measure_baseline(targets, best_constants(targets), worker.metrics)
         members, rows = {}, []
         for number, (camera, target, prediction) in enumerate(zip(cameras, targets, predictions, strict=True)):
-            scores = {
-                "model": measure_all(target, prediction, worker.metrics),
-                "mean_image": mean_image[number],
-                "constant": constant[number],
-                "direct": measure_all(target, sample.views[camera].direct, worker.metrics),
-            }
+            view = sample.views[camera]
+            images = {"model": prediction, "direct": view.direct}
+            if closed_forms is not None:
+                images["closed_form"] = closed_forms[number]
+            measured = {method: measure_all(target, image, worker.metrics) for method, image in images.items()}
+            scores = {**measured, "mean_image": mean_image[number], "constant": constant[number]}
             view_facts = {
-                "roughness": visible_roughness(scene, sample.views[camera].triangle),
+                "roughness": visible_roughness(scene, view.triangle),
                 "noise": view_noise(scene.meta, camera),
+                "regions": region_errors(region_map(scene, view), target, images),
             }
             rows.append({"index": camera, **view_facts, "scores": scores})
             members[f"view{camera}.prediction.exr"] = encode_rgb(prediction)
@@ -152,6 +165,7 @@ class Evaluate(MapStage):
         from stages.graphics.metrics import METRICS, named
         from stages.graphics.statistics import summarise
         from stages.renderformer.evaluation.ceiling import ceiling, noise_pairs
+        from stages.renderformer.evaluation.regions import summarise_regions
         from stages.renderformer.evaluation.report import write_evaluation
         from stages.renderformer.evaluation.runs import run_of
 
@@ -159,6 +173,7 @@ class Evaluate(MapStage):
         scenes = [unpack_json(draft.read(row.id, ("metrics.json",)).members["metrics.json"]) for row in draft.rows()]
         metrics = named({*METRICS, f"lpips_{config.lpips}"})
         summary = summarise(scenes, metrics)
+        summary["regions"] = summarise_regions(scenes)
         summary["ceiling"] = ceiling(scenes, config.split, *noise_pairs(shard, config.split))
         log = [json.loads(line) for line in train.file("log.jsonl").read_text().splitlines() if line]
         summary["train"] = {
@@ -218,10 +233,12 @@ def open_worker(
 
     # Sums in another order round differently: one thread, so that a record is the same for any number of workers.
     torch.set_num_threads(1)
+    model = load_model(inputs["train"].file("checkpoint"))
     return Worker(
         config=config,
         device=environment["device"],
-        model=load_model(inputs["train"].file("checkpoint")),
+        model=model,
+        closed_form=model.without_learning(),
         shard=inputs["shard"],
         metrics=with_lpips(config.lpips, config.lpips_folder),
         mean_images=mean_images,
@@ -260,12 +277,12 @@ def visible_roughness(scene: SceneRecord, triangle: np.ndarray) -> float | None:
     return round(float(weight @ scene.roughness[visible] / weight.sum()), 4) if weight.any() else None
 
 
-def network(checkpoint: Path) -> dict[str, int]:
-    """Size of the network in a released-format checkpoint folder, from its headers alone."""
+def network(checkpoint: Path) -> dict[str, Any]:
+    """What the network in a checkpoint folder is, from its config and its headers alone."""
     from safetensors import safe_open
 
-    config = json.loads((checkpoint / "config.json").read_text())
+    from model.renderformer.architectures import load_config
+
     with safe_open(checkpoint / "model.safetensors", framework="numpy") as file:
         parameters = sum(math.prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118 - not a dict
-    names = {"width": "latent_dim", "layers": "num_layers", "view_layers": "view_transformer_n_layers"}
-    return {"parameters": parameters, **{ours: config[theirs] for ours, theirs in names.items()}}
+    return {"parameters": parameters, "network": load_config(checkpoint / "config.json").description}

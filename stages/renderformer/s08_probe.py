@@ -81,7 +81,13 @@ class RunProbe(MapStage):
         import torch
 
         torch.set_num_threads(1)  # sums in another order round differently
-        return Worker(config, inputs, environment["renderer"], environment["device"])
+        worker = Worker(config, inputs, environment["renderer"], environment["device"])
+        if PROBES[config.name].inside and worker.model.reads_guides:
+            raise UserError(
+                f"probe={config.name} looks into RenderFormer's two stages, which a guided model does not have: choose another "
+                "probe, or another model"
+            )
+        return worker
 
     def process(self, worker: Worker, item: Item) -> Iterator[Record]:
         yield from PROBES[worker.config.name].process(worker, item)
@@ -118,12 +124,10 @@ class RunProbe(MapStage):
 
 def model_facts(worker: Worker) -> dict[str, Any]:
     """What is said of the network."""
-    config = worker.model.config
     return {
         "key": worker.inputs["train"].key,
         "parameters": sum(parameter.numel() for parameter in worker.model.parameters()),
-        "layers": f"{config.num_layers} + {config.view_transformer_n_layers}",
-        "width": config.latent_dim,
+        **worker.model.config.facts,
         "trained_with": worker.trained_with,
     }
 

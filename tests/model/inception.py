@@ -24,7 +24,7 @@ def write_weights(folder: Path) -> None:
             tensors[name] = 0.5 + torch.rand(like.shape, generator=generator)
         elif not name.endswith("num_batches_tracked"):
             tensors[name] = 0.2 * torch.randn(like.shape, generator=generator)
-    torch.save(tensors, folder / INCEPTION_2015.name)
+    torch.save(tensors, folder / INCEPTION_2015.published)
 
 
 def features(w: Mapping[str, Tensor], images: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ def write_weights(folder: Path, network: str) -> None:
         number += 2 if len(layer) == 4 else 1  # a ReLU follows each convolution
     linear = {f"lin{i}.model.1.weight": torch.rand_like(parameter) for i, parameter in enumerate(metric.linear)}
     for tensors, file in zip((features, linear), spec["files"], strict=True):
-        torch.save(tensors, folder / file.name)
+        torch.save(tensors, folder / file.published)
 
 
 def levels(folder: Path, network: str, image: np.ndarray) -> Iterator[np.ndarray]:
@@ -82,4 +82,4 @@ def distance(folder: Path, network: str, a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _arrays(folder: Path, file: WeightFile) -> dict[str, np.ndarray]:
-    return {key: value.double().numpy() for key, value in torch.load(folder / file.name, weights_only=True).items()}
+    return {key: value.double().numpy() for key, value in torch.load(folder / file.published, weights_only=True).items()}

@@ -122,7 +122,7 @@ def test_strict_loading_names_what_is_wrong(tmp_path):
         checkpoint.load(folder)
     folder, _, state = broken("wrong shape")
     save_file(state | {"tri_token": torch.zeros(1, 1, 64)}, folder / "model.safetensors")
-    with pytest.raises(ValueError, match="tri_token has shape"):
+    with pytest.raises(ValueError, match=r"tri_token has shape \(1, 1, 64\), not \(1, 1, 128\)"):
         checkpoint.load(folder)
     with pytest.raises(ValueError, match="config.json is missing"):
         checkpoint.load(tmp_path / "nowhere")
@@ -130,3 +130,63 @@ def test_strict_loading_names_what_is_wrong(tmp_path):
     (folder / "model.safetensors").write_bytes(b"123")
     with pytest.raises(ValueError, match="not a safetensors file"):
         checkpoint.load(folder)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A good checkpoint."""
+    model = RenderFormer(ModelConfig(**MICRO))
+    checkpoint.save(model.config, model.state_dict(), tmp_path / "good", {"triangles": "9"})
+    return tmp_path / "good"
+
+
+@pytest.mark.parametrize("prefix", ["module.", "_orig_mod.", "_orig_mod.module.", "model."])
+def test_a_wrappers_prefix_is_taken_off_and_said(folder, prefix):
+    from safetensors.torch import load_file, save_file
+
+    state, said = load_file(folder / "model.safetensors"), []
+    save_file({prefix + name: value for name, value in state.items()}, folder / "model.safetensors")
+    model, _ = checkpoint.load(folder, said.append)
+    assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
+    assert len(said) == 1 and repr(prefix) in said[0]
+
+
+def test_a_good_checkpoint_says_nothing(folder, capsys):
+    checkpoint.load(folder)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_other_names_are_counted_not_listed(folder):
+    from safetensors.torch import save_file
+
+    save_file({f"{'ab'[i % 2]}.layer{i}": torch.zeros(1) for i in range(90)}, folder / "model.safetensors")
+    with pytest.raises(ValueError, match=r"unknown parameter a.layer0, a.layer10, a.layer12 and 87 more") as error:
+        checkpoint.load(folder)
+    assert len(str(error.value)) < 500
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0123\nsize 820000000\n", "Git LFS pointer.*git lfs pull"),
+        (b"\n<!DOCTYPE html>\n<html><head><title>Sign in</title>", "HTML page.*download the file"),
+        (b"", "is empty.*fetch it again"),
+    ],
+)
+@pytest.mark.parametrize("name", ["model.safetensors", "config.json"])
+def test_what_a_failed_download_left_is_named(folder, name, content, words):
+    (folder / name).write_bytes(content)
+    with pytest.raises(ValueError, match=f"{name} is .*{words}".replace("is .*is", "is")):
+        checkpoint.load(folder)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_renamed_pickle_is_named_and_not_read(folder, zipped):
+    torch.save({"tri_token": torch.zeros(3)}, folder / "model.safetensors", _use_new_zipfile_serialization=zipped)
+    with pytest.raises(ValueError, match=r"is a pickle that was renamed.*save_file"):
+        checkpoint.load(folder)
+
+
+def test_a_config_may_begin_with_a_byte_order_mark(folder):
+    (folder / "config.json").write_bytes(b"\xef\xbb\xbf" + (folder / "config.json").read_bytes())
+    assert checkpoint.load(folder)[1] == {"triangles": "9"}

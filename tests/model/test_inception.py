@@ -13,7 +13,7 @@ from tests.model import inception
 
 def test_the_network_equals_its_description(tmp_path):
     inception.write_weights(tmp_path)
-    network, tensors = Inception.load(tmp_path), read(tmp_path / INCEPTION_2015.name)
+    network, tensors = Inception.load(tmp_path), read(tmp_path / INCEPTION_2015.published)
     images = torch.rand(2, 3, 90, 160, generator=torch.Generator().manual_seed(2))
     with torch.inference_mode():
         found = network(images)
@@ -31,6 +31,6 @@ def test_the_network_has_the_published_number_of_parameters():
 def test_a_file_of_another_network_is_refused(tmp_path):
     with pytest.raises(ValueError, match="lightmill weights inception.*evaluate.inception=false"):
         Inception.load(tmp_path)
-    torch.save({"Conv2d_1a_3x3.conv.weight": torch.zeros(1)}, tmp_path / INCEPTION_2015.name)
+    torch.save({"Conv2d_1a_3x3.conv.weight": torch.zeros(1)}, tmp_path / INCEPTION_2015.published)
     with pytest.raises(ValueError, match="does not hold the Inception network"):
         Inception.load(tmp_path)

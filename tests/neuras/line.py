@@ -35,6 +35,7 @@ def truth() -> Reference:
 
 class CaptureConfig(StageConfig):
     masked: bool = False  # the upper half of every frame does not count, and is white
+    gain: float = 1.0  # of the photos' colours
 
 
 class Capture(MapStage):
@@ -50,7 +51,7 @@ class Capture(MapStage):
         config, scene = worker
         split, shift, position = PLACES[item.id]
         camera = scenes.looking_at(position, size=(96, 64))
-        picture, mask = as_bytes(scene.render(camera)), None
+        picture, mask = as_bytes(config.gain * scene.render(camera)), None
         if config.masked:
             picture[:32] = 255
             mask = encoded(np.repeat(np.arange(64)[:, None] >= 32, 96, axis=1).astype(np.uint8) * 255)

@@ -223,6 +223,17 @@ def test_masked_pixels_are_left_out(run):
         assert not picture(artifacts["evaluate"], id, "difference")[:32].any()
 
 
+def test_exposure_is_found_on_the_left_half_and_scored_on_the_right(run):
+    dim = {"capture": {"gain": 0.6}, "fit": {"error": 0.0}}
+    plain, _ = run(**dim)
+    artifacts, _ = run(**dim, evaluate=QUICK | {"exposure": "half"})
+    before = views_of(plain["evaluate"])
+    for id, row in views_of(artifacts["evaluate"]).items():
+        assert row["counted"] == 0.5 and row["scores"]["ours"]["psnr"] > 45 > 25 > before[id]["scores"]["ours"]["psnr"]
+    assert "found on its left half" in (artifacts["evaluate"].path / "files/report.html").read_text()
+    assert "found on its left half" not in (plain["evaluate"].path / "files/report.html").read_text()
+
+
 def test_without_opengl_and_browser_the_report_says_what_is_missing(run, no_opengl, monkeypatch):
     monkeypatch.setattr(browser, "find_browser", lambda: None)
     artifacts, _ = run(evaluate={**QUICK, "video_frames": 2, "page_views": 2, "depth_tolerance": 0.06})

@@ -21,9 +21,9 @@ from pipeline.store.draft import Draft
 from pipeline.store.files import hash_file
 from stages.graphics.arrays import pack_json
 from stages.graphics.cameras import Camera
+from stages.graphics.casting import Caster
 from stages.graphics.page import png
 from stages.neuras.evaluation.renderers import Reference
-from stages.neuras.rasterizing.casting import Caster
 from stages.neuras.records import FRAME, CaptureInfo, FrameRecord, save
 from stages.neuras.s03_fit import Fit, FitStageConfig
 from tests.model.lpips import write_weights
@@ -130,6 +130,26 @@ def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path, inputs, monkeypatch):
         run(tmp_path / "cut", inputs)
     monkeypatch.setattr(fitting.Trainer, "train_step", step)
     assert run(tmp_path / "cut", inputs)[1] == whole
+
+
+def test_photos_of_other_exposure_leave_the_scene_as_it_is(tmp_path, inputs):
+    """Every other training photo is dark or bright: with the option, the unseen frame comes out as without the trouble."""
+    flat, truth = scenes.atlas(), frame(5, "test", scenes.atlas())
+
+    def exposed(record, gain):
+        picture = io.BytesIO()
+        Image.fromarray(np.clip(record.image() * gain, 0, 255).astype(np.uint8)).save(picture, "png")
+        return dataclasses.replace(record, picture=picture.getvalue())
+
+    records = [exposed(frame(i, "train", flat), (0.7, 1.3)[i % 2]).to_record() for i in range(12) if i != 5]
+    capture = Folder(tmp_path / "capture", records)
+    capture.file("capture.json").write_bytes(inputs["capture"].file("capture.json").read_bytes())
+
+    def error(name, **settings):
+        made, _ = run(tmp_path / name, inputs | {"capture": capture}, CONFIG.model_copy(update=settings))
+        return np.square(Reference(Baked.load(made.files), flat).render(truth.camera) - truth.image() / 255).mean()
+
+    assert error("with", exposure=True, steps=120) < 0.7 * error("without", steps=120)
 
 
 def test_without_training_frames_it_says_so(tmp_path, inputs):

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from pydantic import ValidationError
 
+from stages.graphics.casting import Caster
 from stages.graphics.mitsuba import backend
-from stages.neuras.rasterizing.casting import Caster
 from stages.neuras.street import lidar
 from stages.neuras.street.cameras import poses
 from stages.neuras.street.city import City, make

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from stages.graphics.cameras import Camera
-from stages.neuras.rasterizing.casting import Caster
+from stages.graphics.casting import Caster
 from stages.neuras.rasterizing.footprints import footprint
 from stages.neuras.rasterizing.texels import sheet, texels
 from stages.neuras.records import Mesh

@@ -17,6 +17,7 @@ from pipeline.errors import Reject, UserError
 from pipeline.keys import blake
 from pipeline.stage import Item
 from stages.graphics.geometry import load, measure
+from stages.graphics.geometry.formats import draco
 from stages.graphics.geometry.records import MeshRecord
 from stages.renderformer.objects import catalogue
 from stages.renderformer.objects.procedural import FAMILIES
@@ -129,7 +130,7 @@ MALFORMED = {
     "nan.obj": (obj(NAN), "not_finite"),
     "past_end.obj": (obj(faces=FACES + 1), "bad_indices"),
     "line.obj": (obj(LINE), "degenerate"),
-    "huge.obj": (obj(HUGE), "degenerate"),
+    "huge.obj": (obj(HUGE), "too_large_extent"),
     "far.obj": (obj(FAR), "degenerate"),
     "outside_materials.obj": (obj(head="mtllib ../../secret.mtl"), "unsafe_path"),
     "absolute_materials.obj": (obj(head="mtllib /etc/passwd"), "unsafe_path"),
@@ -266,7 +267,7 @@ def test_parts_come_in_the_same_order_every_time(tmp_path: Path) -> None:
 def test_draco_without_its_decoder_is_refused_by_name(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = shared_data / "meshes" / "market"
     assert len(load.load_mesh(root / "barrel.gltf", root, **LIMITS).faces) == 306
-    monkeypatch.setattr(load.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(draco.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(Reject, match="needs_draco.*DracoPy"):
         load.load_mesh(root / "barrel.gltf", root, **LIMITS)
 
@@ -281,7 +282,9 @@ def test_draco_data_may_not_hold_more_than_is_stated(tmp_path: Path) -> None:
         data = DracoPy.encode(points, faces, compression_level=level)
         for stated, fits in ((len(faces), True), (12, False)):
             tree = gltf()
-            tree["meshes"][0]["primitives"][0]["extensions"] = {load.DRACO: {"bufferView": 0, "attributes": {"POSITION": 0}}}
+            tree["meshes"][0]["primitives"][0]["extensions"] = {
+                draco.EXTENSION: {"bufferView": 0, "attributes": {"POSITION": 0}}
+            }
             tree["accessors"] = [
                 {"componentType": 5126, "count": len(points), "type": "VEC3"},
                 {"componentType": 5125, "count": 3 * stated, "type": "SCALAR"},
@@ -292,7 +295,9 @@ def test_draco_data_may_not_hold_more_than_is_stated(tmp_path: Path) -> None:
             if fits:
                 assert len(load.load_mesh(tmp_path / "a.glb", tmp_path, **LIMITS).faces) == len(faces)
             else:
-                with pytest.raises(Reject, match=f"unreadable: Draco data of {len(faces)} faces where 12 are stated"):
+                with pytest.raises(
+                    Reject, match=f"unreadable: a.glb: .*buffer view 0: Draco data: {len(faces)} faces where 12 are stated"
+                ):
                     load.load_mesh(tmp_path / "a.glb", tmp_path, **LIMITS)
 
 

@@ -18,6 +18,7 @@ from stages.renderformer.dataset import (
     Batches,
     DamagedSample,
     DamagedShard,
+    Needs,
     Relight,
     ShardDataset,
     collate,
@@ -64,7 +65,7 @@ def project(example: dict, points: np.ndarray) -> np.ndarray:
 
 
 def test_without_augmentation_the_stored_arrays(artifact, dataset):
-    batch = Batches(dataset, PLAIN, layers=("direct",))(0)
+    batch = Batches(dataset, PLAIN, needs=Needs(layers=("direct",)))(0)
     assert batch["image"].shape == (4, 2, 12, 12, 3) and len(batch["ids"]) == 4
     assert batch["mask"].shape[1] == batch["mask"].sum(axis=1).max()
     for i, id in enumerate(batch["ids"]):
@@ -238,7 +239,7 @@ def test_only_what_is_wanted_is_decoded(artifact, monkeypatch):
 
 def test_layers_that_are_not_there_are_named(dataset):
     with pytest.raises(UserError, match="layers albdo are unknown: choose from direct, albedo"):
-        Batches(dataset, PLAIN, layers=("albdo",))
+        Batches(dataset, PLAIN, needs=Needs(layers=("albdo",)))
     with pytest.raises(UserError, match=r"read them with layers=\['triangle'\]"):
         make_example(dataset.read(0, [2]), np.array([2]), None, ("triangle",))
     assert "image" not in Batches(dataset, BatchConfig(views_per_scene=0))(0)

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from model.renderformer.config import ModelConfig
 from pipeline.config import StageConfig, parse
 from pipeline.errors import UserError
 from pipeline.stage import Record
@@ -35,6 +36,7 @@ from stages.renderformer.dataset.encoding import encode_scene
 from stages.renderformer.evaluation.baselines import best_constants, mean_images, measure_baseline
 from stages.renderformer.evaluation.ceiling import ceiling, noise_pairs
 from stages.renderformer.evaluation.plots import loss_curves
+from stages.renderformer.evaluation.regions import REGIONS, region_errors, region_map, summarise_regions
 from stages.renderformer.evaluation.runs import facts
 from stages.renderformer.evaluation.tables import markdown
 from stages.renderformer.records import SceneRecord, ViewRecord
@@ -289,8 +291,8 @@ def inputs(tmp_path) -> dict[str, Artifact]:
     test = [("test", shard_record(f"test-{i}", rng, [0, 2], i + 1)) for i in range(3)]
     model = Artifact(tmp_path / "train", [])
     (model.files / "checkpoint").mkdir()
-    config = {"latent_dim": 8, "num_layers": 2, "view_transformer_n_layers": 4}
-    (model.files / "checkpoint" / "config.json").write_text(json.dumps(config))
+    config = ModelConfig(num_layers=2, view_transformer_n_layers=4)
+    (model.files / "checkpoint" / "config.json").write_text(config.dumps())
     save_file(
         {"w": np.zeros((10, 7), np.float32), "b": np.zeros(3, np.float32)}, model.files / "checkpoint" / "model.safetensors"
     )
@@ -307,14 +309,16 @@ def predictor(monkeypatch, inputs):
     """Stands in for the network: ``factor`` times the true image, or a scene's own factor."""
     from stages.renderformer.dataset import decode_sample
 
-    fake = SimpleNamespace(factor=0.9, by_scene={})
+    fake = SimpleNamespace(factor=0.9, by_scene={}, closed_form=None)
 
     def predict_scene(model, scene, views, resolution, device):
         sample = decode_sample(inputs["shard"].read(scene.id))
         assert resolution == SIZE and device == "cpu"
-        return np.stack([sample.views[view].image for view in views]) * fake.by_scene.get(scene.id, fake.factor)
+        factor = fake.by_scene.get(scene.id, fake.factor) if model != "closed form" else 0.5
+        return np.stack([sample.views[view].image for view in views]) * factor
 
-    module = SimpleNamespace(load_model=lambda folder: folder, predict_scene=predict_scene)
+    network = SimpleNamespace(without_learning=lambda: fake.closed_form)
+    module = SimpleNamespace(load_model=lambda folder: network, predict_scene=predict_scene)
     monkeypatch.setitem(sys.modules, "stages.renderformer.inference.predict", module)
     return fake
 
@@ -339,7 +343,7 @@ def test_records_hold_every_score_and_the_predictions(inputs, predictor, tmp_pat
     assert {view["roughness"] for view in metrics["views"]} == {1.0}
     assert [view["index"] for view in metrics["views"]] == [0, 2]  # camera indices, not positions
     for view in metrics["views"]:
-        assert set(view["scores"]) == set(METHODS)
+        assert set(view["scores"]) == set(METHODS) - {"closed_form"}  # RenderFormer starts from no picture
         assert all(set(row) == set(METRICS) for row in view["scores"].values())
     from stages.renderformer.dataset import decode_sample
 
@@ -420,7 +424,7 @@ def test_without_training_scenes_the_mean_image_is_that_of_the_others_and_the_re
     only_test = Artifact(inputs["shard"].path, [("test", inputs["shard"].read(id)) for id in inputs["shard"].ids("test")])
     assert sum(len(block) for block in training_images(only_test, 1000)) == 6
     summary = {
-        "train": dict(layers=1, view_layers=1, width=8, parameters=1, steps=0, key="a"),
+        "train": dict(network="1 + 1 layers, width 8", parameters=1, steps=0, key="a"),
         "data": {"key": "b", "split": "test"},
         "per_scene": [{"resolution": 16}],
     }
@@ -449,12 +453,57 @@ def test_a_log_without_validation_still_draws():
     assert loss_curves({"given": []}) == ""
 
 
+def test_what_a_network_starts_from_is_scored_beside_it(inputs, predictor, tmp_path):
+    predictor.closed_form = "closed form"
+    records, draft = evaluate(EvaluateConfig(), inputs, tmp_path / "evaluate")
+    view = unpack_json(records[0].members["metrics.json"])["views"][0]
+    assert view["scores"]["closed_form"]["psnr"] < view["scores"]["model"]["psnr"]
+    summary = json.loads(draft.file("metrics.json").read_text())
+    assert summary["gains"]["closed_form"]["psnr"]["mean"] > 0 and "closed_form" in summary["regions"][0]["error"]
+    assert "closed form alone, nothing learned" in draft.file("metrics.md").read_text()
+
+
+class TestRegions:
+    """Two objects side by side, a third of the picture empty; the right one is a mirror."""
+
+    @pytest.fixture
+    def view(self) -> SimpleNamespace:
+        triangle = np.full((12, 12), -1)
+        triangle[:, :4], triangle[:, 4:8] = 0, 1
+        image, direct = np.ones((12, 12, 3)), np.ones((12, 12, 3))
+        direct[6:] = 0.1
+        return SimpleNamespace(triangle=triangle, object=triangle, coverage=(triangle >= 0) * 1.0, image=image, direct=direct)
+
+    @pytest.fixture
+    def scene(self) -> SimpleNamespace:
+        diffuse, specular = np.array([[0.9] * 3, [0.1] * 3]), np.array([[0.05] * 3, [0.8] * 3])
+        return SimpleNamespace(diffuse=diffuse, specular=specular, roughness=np.array([0.1, 0.1]))
+
+    def test_every_pixel_has_the_region_that_its_surface_says(self, scene, view):
+        names = np.array(list(REGIONS))[region_map(scene, view)]
+        assert (names[:6, :3] == "lit diffuse").all() and (names[6:, :3] == "shadowed diffuse").all()
+        assert (names[:, 5:7] == "smooth specular").all() and (names[:, 8:] == "nothing").all()
+        assert (names[:, [3, 4, 7]] == "silhouette").all()
+        scene.roughness[1] = 0.5
+        assert (np.array(list(REGIONS))[region_map(scene, view)][:, 5:7] == "rough specular").all()
+
+    def test_errors_of_regions_add_up_to_that_of_the_picture(self, scene, view):
+        test = view.image * np.linspace(1, 2, 12)[:, None]
+        rows = region_errors(region_map(scene, view), view.image, {"model": test, "direct": view.direct})
+        assert sum(row["pixels"] for row in rows.values()) == 144
+        whole = np.abs(np.log10(1 + test) - np.log10(2)).mean()
+        assert sum(row["pixels"] * row["model"] for row in rows.values()) / 144 == pytest.approx(whole, rel=1e-5)
+        (first, *_) = summary = summarise_regions([{"views": [{"regions": rows}] * 2}])
+        assert sum(row["part"]["model"] for row in summary) == pytest.approx(1)
+        assert first["region"] == "silhouette" and first["share"] == pytest.approx(0.25)
+
+
 @pytest.mark.parametrize("variant", [{}, {"use_dpt_decoder": False}, {"pe_type": "nerf", "use_dpt_decoder": False}])
 def test_every_step_of_a_model_is_timed_and_nothing_stays_hooked(inputs, variant):
     from model.renderformer.config import ModelConfig
     from model.renderformer.network import RenderFormer
     from stages.renderformer.dataset import decode_sample
-    from stages.renderformer.evaluation.timing import REPEATS, STEPS, time_model
+    from stages.renderformer.evaluation.timing import REPEATS, time_model
 
     small = dict(
         latent_dim=128, num_layers=1, num_heads=1, dim_feedforward=128, num_register_tokens=2, texture_encode_patch_size=1,
@@ -468,7 +517,8 @@ def test_every_step_of_a_model_is_timed_and_nothing_stays_hooked(inputs, variant
     timing = time_model(model, samples, "cpu")
     assert len(runs) == 2 * (REPEATS + 1)
     assert [row["id"] for row in timing["scenes"]] == ["test-0", "test-2"] and timing["resolution"] == SIZE
-    assert set(timing["median"]) == set(STEPS)
-    assert all(row[step] > 0 for row in timing["scenes"] for step in STEPS if step != "project" or "pe_type" not in variant)
+    steps = ("encode", "project", "rays", "head")
+    assert tuple(timing["median"]) == steps
+    assert all(row[step] > 0 for row in timing["scenes"] for step in steps if step != "project" or "pe_type" not in variant)
     head = model.view_transformer.out_proj if "use_dpt_decoder" in variant else model.view_transformer.out_dpt
     assert not head._forward_pre_hooks

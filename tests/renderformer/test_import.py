@@ -97,27 +97,23 @@ def test_the_key_is_that_of_the_content(folder, tmp_path):
     assert after["scene"] != before["scene"] and after["render"] != before["render"]
 
 
-def test_the_key_follows_every_file_that_a_mesh_names(tmp_path):
-    """Buffers and images of a glTF, libraries and images of an OBJ, the image of a PLY; what is opened, and nothing else."""
+def test_the_key_follows_every_file_that_is_opened(tmp_path):
+    """The mesh and the buffers of a glTF; not the libraries and images of materials, which are the scene's own."""
     import trimesh
 
-    (tmp_path / "maps").mkdir()
     mesh = trimesh.load(io.StringIO(MESH), file_type="obj")
     for name, data in mesh.export(file_type="gltf").items():
         (tmp_path / name.replace("model", "solid")).write_bytes(data)
     tree = json.loads((tmp_path / "solid.gltf").read_bytes())
-    (tmp_path / tree["buffers"][0]["uri"]).rename(tmp_path / "solid.dat")
-    tree["buffers"] = [{"uri": "solid.dat", "byteLength": (tmp_path / "solid.dat").stat().st_size}]
+    (tmp_path / tree["buffers"][0]["uri"]).rename(tmp_path / "solid.bin")
+    tree["buffers"] = [{"uri": "solid.bin", "byteLength": (tmp_path / "solid.bin").stat().st_size}]
     tree["bufferViews"] = [view | {"buffer": 0} for view in tree["bufferViews"]]
     tree["images"] = [{"uri": "/maps/a.png"}, {"uri": "data:image/png;base64,AA=="}, {"uri": "missing.png"}]
     (tmp_path / "solid.gltf").write_text(json.dumps(tree))
-    (tmp_path / "solid.obj").write_text("mtllib colours.lib\n" + MESH)
-    (tmp_path / "colours.lib").write_text("newmtl a\nmap_Kd maps/b.png\n")
-    ply = mesh.export(file_type="ply")
-    (tmp_path / "solid.ply").write_bytes(ply.replace(b"end_header", b"comment TextureFile c.tif\nend_header", 1))
-    beside = {"solid.gltf": ["solid.dat", "maps/a.png"], "solid.obj": ["colours.lib", "maps/b.png"], "solid.ply": ["c.tif"]}
-    for name in ("maps/a.png", "maps/b.png", "c.tif"):
-        (tmp_path / name).write_bytes(b"picture")
+    (tmp_path / "solid.obj").write_text("mtllib colours.mtl\n" + MESH)
+    (tmp_path / "colours.mtl").write_text("newmtl a\nKd 1 0 0\n")
+    (tmp_path / "solid.ply").write_bytes(mesh.export(file_type="ply"))
+    beside = {"solid.gltf": ["solid.bin"], "solid.obj": [], "solid.ply": []}
     (tmp_path / "unrelated.bin").write_bytes(b"1")
     stage, config = ImportScene(), ImportConfig(path=str(tmp_path))
 

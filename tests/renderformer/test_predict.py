@@ -402,7 +402,7 @@ def bad_scenes() -> dict:
 
     return {
         "gone.obj does not exist": missing_mesh,
-        "vertex 1 of": nan_vertex,
+        "nan.obj: line 2: a coordinate": nan_vertex,
         "has no light": without_light,
         "has no camera": no_camera,
     }
@@ -427,7 +427,8 @@ def test_a_bad_scene_is_named_in_one_line(checkpoint, scene_json, tmp_path, caps
         ("empty.stl", b"solid a\nendsolid a\n", "there is no triangle in it"),
         ("text.glb", b"not a mesh", "truncated, malformed"),
         ("line.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no area"),
-        ("scene.blend", b"", "neither a scene nor a mesh"),
+        ("scene.blend", b"", "in Blender, and choose File > Export > glTF"),
+        ("scene.txt", b"", "neither a scene nor a mesh"),
         ("scene.json", b"{", "is not JSON"),
         ("scene.h5", b"\x89HDF", "is not an HDF5 file"),
     ],

@@ -337,7 +337,7 @@ def test_guiding_finds_caustics_and_keeps_the_mean(jit):
 
     few, means = {}, {}
     for guided in (False, True):
-        renderer = JitRenderer(caustic(), 32, 4, Limits(8), False, guided)
+        renderer = JitRenderer(caustic(), (32, 32), 4, Limits(8), False, guided)
         renderer.sample([0], [0, 1], 0, 16)
         renderer.learn([0])
         few[guided], means[guided] = images(renderer, 16, 16), np.mean(images(renderer, 32, 2048))
@@ -358,7 +358,7 @@ def test_samples_in_portions_are_the_same_samples(jit):
     from stages.renderformer.rendering.jit import JitRenderer, Limits
 
     backends.activate(jit)
-    renderer = JitRenderer(clutter(), 16, 4, Limits(8), False)
+    renderer = JitRenderer(clutter(), (16, 16), 4, Limits(8), False)
     whole = renderer.sample([0, 1], [0, 1], 0, 32)
     portions = [renderer.sample([0, 1], [0, 1], first, 16) for first in (0, 16)]
     assert not np.array_equal(whole[0][0].lights, whole[1][0].lights)

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from model.renderformer.config import ModelConfig
 from pipeline.errors import UserError
 from pipeline.keys import digest_of
 from pipeline.store import Artifact, Store
@@ -44,8 +45,8 @@ def trained(store: Store, name: str, shard: Artifact) -> Artifact:
     def fill(draft):
         folder = draft.files / "checkpoint"
         folder.mkdir()
-        config = {"latent_dim": 8, "num_layers": 2, "view_transformer_n_layers": 4}
-        (folder / "config.json").write_text(json.dumps(config))
+        config = ModelConfig(num_layers=2, view_transformer_n_layers=4)
+        (folder / "config.json").write_text(config.dumps())
         save_file({"weight": np.zeros((3, 4), np.float32)}, folder / "model.safetensors")
         (draft.files / "log.jsonl").write_text('{"step": 10, "loss": 0.5}\n{"step": 20, "loss": 0.25}\n')
         return []
@@ -64,8 +65,13 @@ def factor(monkeypatch):
         sample = decode_sample(fake.shard.read(scene.id))
         return np.stack([sample.views[view].image for view in views]) * fake.value
 
+    def load_model(folder):
+        return SimpleNamespace(without_learning=lambda: None)
+
     monkeypatch.setitem(
-        sys.modules, "stages.renderformer.inference.predict", SimpleNamespace(load_model=str, predict_scene=predict_scene)
+        sys.modules,
+        "stages.renderformer.inference.predict",
+        SimpleNamespace(load_model=load_model, predict_scene=predict_scene),
     )
     return fake
 

@@ -224,17 +224,17 @@ def test_texture_transforms_and_integer_coordinates(tmp_path):
 @pytest.mark.parametrize(
     ("image", "note"),
     [
-        (data_uri(b"not an image"), "UnidentifiedImageError"),
-        (data_uri(png(RED_GREEN)[:44]), "Error"),
+        (data_uri(b"not an image"), "no image in a format that is read (.bmp"),
+        (data_uri(png(RED_GREEN)[:44]), "a damaged image"),
         (data_uri(png(RED_GREEN, claimed=(9000, 9000))), "9000 x 9000 pixels"),
-        (data_uri(png(RED_GREEN, claimed=(60000, 60000))), "DecompressionBomb"),
+        (data_uri(png(RED_GREEN, claimed=(60000, 60000))), "over 67108864 pixels"),
         ({"uri": "../secret.png"}, "refers to"),
         ({"uri": "/etc/secret.png"}, "refers to"),
         ({"uri": "link.png"}, "refers to"),
         ({"uri": "notes.txt"}, "not one of"),
         ({"uri": "none.png"}, "missing"),
-        ({"bufferView": 99}, "range"),
-        ({}, "uri"),
+        ({"bufferView": 99}, "buffer view 99 does not exist"),
+        ({}, "neither a uri nor a buffer view"),
     ],
 )
 def test_a_bad_image_costs_its_colour_and_not_the_mesh(tmp_path, image, note):
@@ -268,10 +268,11 @@ def test_large_images_are_averaged_in_linear_light():
 
 
 def test_material_colours_alone_are_base_colours(shared_data):
-    """A tractor without images shows the colours of its materials; a bowl of one colour has nothing to show."""
+    """A tractor without images shows the colours of its materials, and a bowl its one."""
     market = shared_data / "meshes" / "market"
     tractor, bowl = (load_textured(market / name) for name in ("tractor.gltf", "bowl.gltf"))
-    assert len(tractor.texture.colour) == 7 and tractor.texture.images == [] and bowl.texture is None
+    assert len(tractor.texture.colour) == 7 and tractor.texture.images == []
+    assert bowl.texture.colour.shape == (1, 3) and bowl.texture.images == []
 
 
 def test_a_folder_with_textures_keeps_its_meshes_and_knows_its_images(tmp_path):

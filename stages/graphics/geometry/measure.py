@@ -29,6 +29,14 @@ def face_normals(corners: np.ndarray) -> np.ndarray:
     return np.where(length > 0, vectors / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
 
 
+def have_area(corners: np.ndarray) -> np.ndarray:
+    """(F,) bool of (F, 3, 3) float32 triangles: those wider than a few roundings of their coordinates."""
+    corners = np.asarray(corners, np.float64)
+    longest = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
+    rounding = 4 * np.finfo(np.float32).eps * np.abs(corners).max(axis=(1, 2))
+    return np.linalg.norm(normal_vectors(corners), axis=1) > longest * rounding
+
+
 def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F, 3): ``normal_vectors`` of a mesh."""
     return normal_vectors(corners_of(vertices, faces))
@@ -92,12 +100,17 @@ def min_angle_deg(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def crossing(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Share of the faces that pass through another one."""
+    return round(int(crossing_faces(vertices, faces).sum()) / len(faces), 4)
+
+
+def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) bool: faces that pass through another one."""
     import pymeshlab
 
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32)))
     meshes.compute_selection_by_self_intersections_per_face()
-    return round(meshes.current_mesh().selected_face_number() / len(faces), 4)
+    return np.asarray(meshes.current_mesh().face_selection_array(), bool)
 
 
 def content_hash(vertices: np.ndarray, faces: np.ndarray) -> str:

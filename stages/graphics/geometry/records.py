@@ -50,6 +50,7 @@ class TextureRecord:
     material: (F,) int32, a row of the following. colour: (M, 3) float32, linear factor of the image or the colour itself.
     image: (M,) int16 into ``images``, -1 = none. wrap: (M, 2) uint8 along u and v, an index into ``WRAPS``.
     images: (H, W, 3) uint8 each, sRGB, row 0 on top.
+    tint: (F, 3, 3) float32 linear colours of the corners, which multiply all that; None where there are none.
     """
 
     id: str
@@ -59,6 +60,7 @@ class TextureRecord:
     image: np.ndarray
     wrap: np.ndarray
     images: list[np.ndarray]
+    tint: np.ndarray | None = None
 
     SUFFIX = "-texture"
     WRAPS = ("repeat", "clamp", "mirror")
@@ -67,10 +69,13 @@ class TextureRecord:
     def to_record(self) -> Record:
         arrays = {name: np.asarray(getattr(self, name)).astype(dtype) for name, dtype in self.DTYPES.items()}
         arrays |= {f"image{index}": image for index, image in enumerate(self.images)}
+        if self.tint is not None:
+            arrays["tint"] = self.tint.astype(np.float32)
         return Record(self.id, {"texture.npz": pack_arrays(arrays, compressed=True)})
 
     @classmethod
     def from_record(cls, record: Record) -> TextureRecord:
         arrays = unpack_arrays(record.members["texture.npz"])
+        tint = arrays.pop("tint", None)
         images = [arrays[f"image{index}"] for index in range(len(arrays) - len(cls.DTYPES))]
-        return cls(record.id, **{name: arrays[name] for name in cls.DTYPES}, images=images)
+        return cls(record.id, **{name: arrays[name] for name in cls.DTYPES}, images=images, tint=tint)

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import Reject, UserError
-from stages.graphics.geometry.load import check_claims
+from stages.graphics.geometry.formats import ply
+from stages.graphics.geometry.formats.faults import at
+from stages.graphics.geometry.formats.parts import Source
 from stages.graphics.geometry.paths import inside
 from stages.neuras.captures import poses
 from stages.neuras.captures.lenses import Lens
@@ -133,12 +135,8 @@ def _points(config: FolderConfig, root: Path, told: dict[str, Any]) -> list[Poin
 
 def ply_points(path: Path, max_bytes: int) -> np.ndarray:
     """(P, 3) float32: the vertices of a PLY; raises Reject."""
-    import trimesh
-
-    check_claims(path, max_bytes, 1 << 40)
-    try:
-        with path.open("rb") as file:
-            loaded = trimesh.load(file, file_type="ply", process=False)
-        return np.asarray(loaded.vertices, np.float32).reshape(-1, 3)
-    except Exception as error:  # parsers of strangers' files fail in every way
-        raise Reject("unreadable", f"{path.name}: {type(error).__name__}: {str(error)[:150]}") from None
+    source = Source(path, path.parent, max_bytes, 1 << 40)
+    with at(path.name):
+        if path.stat().st_size > max_bytes:
+            raise Reject("too_large", f"{path.stat().st_size} bytes, at most {max_bytes} are read")
+        return ply.read_points(path.read_bytes(), source).astype(np.float32)

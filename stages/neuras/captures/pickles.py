@@ -1,4 +1,4 @@
-"""Tables of numbers in strangers' pandas pickles, without running anything that the pickle asks for.
+"""Tables of numbers and words in strangers' pandas pickles, without running anything that the pickle asks for.
 
 Every name that such a pickle may use becomes an inert ``_Stub``; any other name is refused. What the stubs hold is then
 read as a table: neither pandas nor numpy's own unpickling takes part.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import gzip
 import io
 import pickle
+import pickletools
 import re
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 from pipeline.errors import Reject
 
 MAX_FILE, MAX_BYTES = 256 << 20, 1 << 30  # as it lies there, and unpacked
+BLOCK = 1 << 20  # bytes unpacked at a time
 
 _MODULES = {
     "DataFrame": ("pandas", "pandas.core.frame"),
@@ -54,19 +56,25 @@ class _Stub:
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in KNOWN:
-            raise Reject("unreadable", f"the pickle asks for {module}.{name}: only plain tables of numbers are read")
+            raise Reject("unreadable", f"the pickle asks for {module}.{name}: only plain tables are read")
         return type(name, (_Stub,), {"name": name})
 
 
 def table(path: Path) -> dict[str, np.ndarray]:
-    """The columns of numbers, by name, of a pickled data frame (``.pkl`` or ``.pkl.gz``); raises Reject."""
+    """The columns, by name, of a pickled data frame (``.pkl`` or ``.pkl.gz``); raises Reject.
+
+    Columns of words are arrays of objects: strings, and None for anything else.
+    """
     if path.stat().st_size > MAX_FILE:
         raise Reject("too_large", f"{path.name} has {path.stat().st_size} bytes, at most {MAX_FILE} are read")
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise Reject("too_large", f"{path.name} unpacks to over {MAX_BYTES} bytes")
+            data = bytearray()
+            while block := file.read(BLOCK):
+                data += block
+                if len(data) > MAX_BYTES:
+                    raise Reject("too_large", f"{path.name} unpacks to over {MAX_BYTES} bytes")
+        _check_claims(data)
         return _columns(_Unpickler(io.BytesIO(data)).load())
     except Reject:
         raise
@@ -74,6 +82,13 @@ def table(path: Path) -> dict[str, np.ndarray]:
         raise
     except Exception as error:  # a stranger's pickle fails in every way
         raise Reject("unreadable", f"{path.name}: {type(error).__name__}: {str(error)[:150]}") from None
+
+
+def _check_claims(data: bytearray) -> None:
+    """Raises ValueError where a length or a number of the memo is more than the bytes can hold: loading would reserve it."""
+    for code, value, _ in pickletools.genops(data):  # itself takes what is there, never what is claimed
+        if "PUT" in code.name and value > len(data):
+            raise ValueError(f"it numbers {value} values in {len(data)} bytes")
 
 
 def _columns(frame: Any) -> dict[str, np.ndarray]:
@@ -89,9 +104,9 @@ def _columns(frame: Any) -> dict[str, np.ndarray]:
     names = _index(axes[0])
     columns = {}
     for values, places in parts:
-        if not _is_numbers(values):
+        if not (_is_numbers(values) or _is_objects(values)):
             continue
-        rows, numbers = _array(values), _places(places)
+        rows, numbers = _array(values) if _is_numbers(values) else _words(values), _places(places)
         if rows.ndim != 2 or len(rows) != len(numbers):
             raise ValueError(f"a block of shape {rows.shape} for {len(numbers)} columns")
         columns |= {str(names[number]): row for number, row in zip(numbers, rows, strict=True)}
@@ -118,6 +133,18 @@ def _is_numbers(stub: Any) -> bool:
     return isinstance(stub, _Stub) and (
         stub.name == "_frombuffer" or (stub.name == "_reconstruct" and isinstance(stub.state[-1], (bytes, bytearray, _Stub)))
     )
+
+
+def _is_objects(stub: Any) -> bool:
+    return isinstance(stub, _Stub) and stub.name == "_reconstruct" and isinstance(stub.state[-1], list)
+
+
+def _words(stub: _Stub) -> np.ndarray:
+    """Of an array of objects, the strings."""
+    shape, _, fortran, values = stub.state[-4:]
+    words = np.empty(len(values), object)
+    words[:] = [value if isinstance(value, str) else None for value in values]
+    return words.reshape(shape, order="F" if fortran else "C")
 
 
 def _array(stub: _Stub) -> np.ndarray:

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from pipeline.errors import Reject
 from stages.neuras.captures.lenses import Lens, bilinear, sources, undistorted
@@ -28,19 +29,33 @@ class Picture:
     size: tuple[int, int]
 
 
-def made(image_file: Path, mask_file: Path | None, lens: Lens, max_side: int | None, max_pixels: int) -> Picture:
+@dataclass(frozen=True)
+class Original:
+    """A picture as a set has it.
+
+    image, mask: files. outlines: polygons [[x, y], ..] of pixels that do not count, of things that move. backdrop: the
+    colour (0 to 255) behind an alpha channel; None: the channel is dropped.
+    """
+
+    image: Path
+    lens: Lens
+    mask: Path | None = None
+    outlines: Sequence[Sequence[Sequence[float]]] = ()
+    backdrop: tuple[int, int, int] | None = None
+
+
+def made(original: Original, max_side: int | None, max_pixels: int) -> Picture:
     """The picture as a pinhole of at most ``max_side`` pixels sees it; raises Reject."""
-    image = _opened(image_file, max_pixels, "image")
+    lens = original.lens
+    image = _opened(original.image, max_pixels, "image")
     if image.size != (lens.width, lens.height):
-        raise Reject("size", f"the image has {_times(image.size)} pixels, its intrinsics are for {lens.width} x {lens.height}")
-    mask = None
-    if mask_file is not None:
-        mask = np.array(_opened(mask_file, max_pixels, "mask").convert("L")) > 0
-        if mask.shape != (lens.height, lens.width):
-            raise Reject("mask_size", f"the mask has {_times(mask.shape[::-1])} pixels, the image {_times(image.size)}")
+        raise Reject("size", _other_size(image.size, lens))
+    if original.backdrop is not None and image.has_transparency_data:
+        image = _over(image, original.backdrop)
+    mask = _mask(original, image.size, max_pixels)
     size = _fitting(image.size, max_side)
     if lens.straight and size == image.size and image.format in ("JPEG", "PNG") and image.mode == "RGB":
-        return Picture(image_file.read_bytes(), None if mask is None else _png(_drawn(mask)), size)
+        return Picture(original.image.read_bytes(), None if mask is None else _png(_drawn(mask)), size)
     pixels = np.array(image.convert("RGB"))
     if not lens.straight:
         pixels, inside = undistorted(pixels, lens)
@@ -54,6 +69,36 @@ def made(image_file: Path, mask_file: Path | None, lens: Lens, max_side: int | N
         # a pixel counts where all that it covers counts
         drawn = drawn and drawn.resize(size, Image.Resampling.BOX).point(lambda value: 255 if value == 255 else 0)
     return Picture(_png(picture), drawn and _png(drawn), size)
+
+
+def _mask(original: Original, size: tuple[int, int], max_pixels: int) -> np.ndarray | None:
+    """(H, W) bool: the pixels that count; None where all do."""
+    if original.mask is None and not original.outlines:
+        return None
+    width, height = size
+    mask = np.ones((height, width), bool)
+    if original.mask is not None:
+        mask = np.array(_opened(original.mask, max_pixels, "mask").convert("L")) > 0
+        if mask.shape != (height, width):
+            raise Reject("mask_size", f"the mask has {_times(mask.shape[::-1])} pixels, the image {_times(size)}")
+    drawn = _drawn(mask)
+    for outline in original.outlines:
+        ImageDraw.Draw(drawn).polygon([tuple(point) for point in outline], fill=0)
+    return np.array(drawn) > 0
+
+
+def _over(image: Image.Image, backdrop: tuple[int, int, int]) -> Image.Image:
+    """The image in front of one colour, mixed as the values stand, as the data sets that have such images do it."""
+    ground = Image.new("RGBA", image.size, (*backdrop, 255))
+    return Image.alpha_composite(ground, image.convert("RGBA")).convert("RGB")
+
+
+def _other_size(size: tuple[int, int], lens: Lens) -> str:
+    said = f"the image has {_times(size)} pixels, its intrinsics are for {lens.width} x {lens.height}"
+    across, down = size[0] / lens.width, size[1] / lens.height
+    if abs(across / down - 1) > 0.01:
+        return f"{said}: another camera's, or the image was cut or turned"
+    return f"{said}: multiply the focal lengths, the principal point and the size in the set's file by {across:.4g}"
 
 
 def size_of(path: Path) -> tuple[int, int]:

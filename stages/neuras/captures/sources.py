@@ -7,6 +7,7 @@ what is wrong with the whole set is a UserError at once.
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
@@ -17,14 +18,16 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from pydantic import Field
 
-from pipeline.config import StageConfig, count, existing_folder, report, runtime
+from pipeline.config import StageConfig, added, count, existing_folder, report, runtime
 from pipeline.errors import Reject, UserError
 from pipeline.keys import digest_of
-from stages.graphics.geometry.paths import check_path
+from stages.graphics.geometry.load import SUFFIXES, load_mesh
+from stages.graphics.geometry.paths import check_path, inside
 from stages.neuras.captures import pictures, poses, splits
 from stages.neuras.captures.lenses import Lens
 from stages.neuras.records import FRAME, POINTS, CaptureInfo, FrameRecord, Mesh, PointsRecord, Split
 
+FEWEST = 3  # usable frames
 SEEN = 50_000  # points that decide the capture's ball
 AXES = {sign + name: tuple((-1.0 if sign else 1.0) * (name == axis) for axis in "xyz") for name in "xyz" for sign in ("", "-")}
 
@@ -55,10 +58,13 @@ class FolderConfig(StageConfig):
     """What the captures in folders have in common."""
 
     path: str | None = runtime(None)  # capture.path=DIR; the content of its files is what counts
-    mesh: str | None = runtime(None)  # a mesh to learn on; null: mesh.ply, mesh.glb or mesh.obj in the folder, if there is one
+    mesh: str | None = runtime(
+        None
+    )  # a mesh to learn on, or a folder of its tiles; null: mesh.ply, mesh.glb or mesh.obj in the folder, if there is one
     every: int = count(1, ge=1)  # keep every so-many-th frame, of each split by itself where the set names them
-    split: splits.Rule = "auto"  # auto: the names that the set gives, else every_other
+    split: splits.RuleName = "auto"  # auto: the names that the set gives, else every_other
     seed: int = 0  # of random_half
+    nth: int = added(8, legacy=8, ge=3)  # of every_nth: one frame in so many is for training
     max_side: int | None = Field(None, ge=16)  # longest side of a picture in pixels, larger ones are made smaller
     units: Literal["auto", "metre", "arbitrary"] = report("auto")  # auto: what the set says, else arbitrary
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = report("auto")  # auto: what the set says, else from the cameras
@@ -69,12 +75,17 @@ class FolderConfig(StageConfig):
 
 @dataclass
 class Shot:
-    """A posed image as a set on disk states it. moment: what frames taken at one time share. split: as the set names it."""
+    """A posed image as a set on disk states it. moment: what frames taken at one time share. split: as the set names it.
+
+    mask, outlines, backdrop: see ``pictures.Original``.
+    """
 
     name: str  # of the image, relative to the capture's folder, for people
     moment: Hashable = None
     image: Path | None = None
     mask: Path | None = None
+    outlines: list[list[list[float]]] = field(default_factory=list)
+    backdrop: tuple[int, int, int] | None = None
     lens: Lens | None = None
     camera_to_world: np.ndarray | None = None
     split: Split | None = None
@@ -85,20 +96,24 @@ class Shot:
 
 @dataclass
 class PointSet:
-    """Points in a file, read when they are asked for. read: (P, 3) float32 and the sensor's position (3,) or None.
+    """Points, read when they are asked for. read: (P, 3) float32 and the sensor's position (3,) or None. file: if it is one's.
 
-    moment: of the frames that were taken with it; None for what belongs to no one time.
+    moment: of the frames that were taken with it; None for what belongs to no one time. facts: what decides the points
+    besides the file.
     """
 
     name: str
-    file: Path
+    file: Path | None
     read: Callable[[], tuple[np.ndarray, np.ndarray | None]]
     moment: Hashable = None
+    facts: Any = None
 
 
 @dataclass
 class Inventory:
-    """What a reader finds. units and up: None where the set does not say. units_from: where it says so, in words."""
+    """What a reader finds. units and up: None where the set does not say. units_from: where it says so, in words. mesh: the
+    files of the set's own mesh. decided_by: files that decide every frame and all points.
+    """
 
     shots: list[Shot]
     sets: list[PointSet] = field(default_factory=list)
@@ -106,6 +121,8 @@ class Inventory:
     units: Literal["metre", "arbitrary"] | None = None
     units_from: str = "nothing in the set says it"
     up: tuple[float, float, float] | None = None
+    mesh: list[Path] = field(default_factory=list)
+    decided_by: list[Path] = field(default_factory=list)
 
 
 def shot_of(name: str, fill: Callable[[Shot], None]) -> Shot:
@@ -128,26 +145,43 @@ def file_in(root: Path, name: Any, what: str) -> Path:
     return path
 
 
+def json_in(root: Path, path: Path, kind: type) -> Any:
+    """The content of a JSON file that a set must have; raises UserError."""
+    if not inside(path, root):
+        raise UserError(f"{str(path)!r} leads out of {str(root)!r}")
+    try:
+        value = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise UserError(f"there is no {str(path)!r}: the set must lie in its own layout (docs/captures.md)") from None
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{str(path)!r} is not JSON: {error}") from None
+    if not isinstance(value, kind):
+        raise UserError(f"{str(path)!r} does not hold a {kind.__name__}")
+    return value
+
+
 class FolderSource:
     """The capture in a folder, by a reader of its kind."""
 
-    def __init__(self, config: FolderConfig, read: Callable[[FolderConfig, Path], Inventory]):
+    def __init__(self, config: FolderConfig, read: Callable[[FolderConfig, Path], Inventory], root: Path | None = None):
         self.config = config
-        self.root = existing_folder("capture.path", config.path, f"capture={config.name} needs a folder")
+        self.root = root or existing_folder("capture.path", config.path, f"capture={config.name} needs a folder")
         self.inventory = read(config, self.root)
         shots = self.inventory.shots
         kept = splits.kept([shot.split for shot in shots], config.every)
         self.shots = dict(zip(_ids([shots[index].name for index in kept]), (shots[index] for index in kept), strict=True))
         chosen = list(self.shots.values())
         assigned, self.split_rule = splits.assigned(
-            [shot.moment for shot in chosen], [shot.split for shot in chosen], config.split, config.seed
+            [shot.moment for shot in chosen],
+            [shot.split for shot in chosen],
+            splits.Rule(config.split, config.seed, config.nth),
         )
         self.splits = dict(zip(self.shots, assigned, strict=True))
         if config.every > 1:
             self.split_rule += f"; of the set's frames one in {config.every} is taken"
         held = {shot.moment for shot, split in zip(chosen, assigned, strict=True) if split == "test"}
         self.sets = {f"{POINTS}{it.name}": it for it in self.inventory.sets if it.moment is None or it.moment not in held}
-        self.mesh_file = _mesh_file(config, self.root)
+        self.mesh_files = _mesh_files(config, self.root) or self.inventory.mesh
         self._check()
 
     def items(self) -> list[tuple[str, str]]:
@@ -157,7 +191,8 @@ class FolderSource:
         shot = self.shots[id]
         if shot.fault is not None:
             raise shot.fault
-        picture = pictures.made(shot.image, shot.mask, shot.lens, self.config.max_side, self.config.max_pixels)
+        original = pictures.Original(shot.image, shot.lens, shot.mask, shot.outlines, shot.backdrop)
+        picture = pictures.made(original, self.config.max_side, self.config.max_pixels)
         camera = shot.lens.camera(shot.camera_to_world).resized(*picture.size)
         return FrameRecord(
             id, camera, picture.image, self.splits[id], time=shot.time, mask=picture.mask, meta={"file": shot.name, **shot.meta}
@@ -167,20 +202,24 @@ class FolderSource:
         points, sensor = self.sets[id].read()
         finite = np.isfinite(points).all(axis=1)
         if not finite.any():
-            raise Reject("no_points", f"{self.sets[id].file.name} holds no point")
+            raise Reject("no_points", f"{id} holds no point")
         return PointsRecord(id, points[finite].astype(np.float32), sensor)
 
     def mesh(self) -> Mesh | None:
         """The given mesh; UserError where it is none."""
-        from stages.graphics.geometry.load import load_mesh
-
-        if self.mesh_file is None:
+        vertices, faces = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)]
+        for path in self.mesh_files:
+            try:
+                loaded = load_mesh(path, path.parent, self.config.max_bytes, self.config.max_faces)
+            except Reject as error:
+                raise UserError(f"the mesh {str(path)!r} cannot be used: {error.detail}") from None
+            faces.append(loaded.faces + sum(map(len, vertices)))
+            vertices.append(loaded.vertices)
+        if not self.mesh_files:
             return None
-        try:
-            loaded = load_mesh(self.mesh_file, self.mesh_file.parent, self.config.max_bytes, self.config.max_faces)
-        except Reject as error:
-            raise UserError(f"the mesh {str(self.mesh_file)!r} cannot be used: {error.detail}") from None
-        return Mesh(loaded.vertices.astype(np.float32), loaded.faces.astype(np.int32))
+        if (number := sum(map(len, faces))) > self.config.max_faces:
+            raise UserError(f"the mesh has {number:,} faces, over capture.max_faces={self.config.max_faces:,}")
+        return Mesh(np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32))
 
     def info(self) -> CaptureInfo:
         config, inventory = self.config, self.inventory
@@ -208,6 +247,7 @@ class FolderSource:
     def hashes(self, hash_file: Callable[[Any], str]) -> dict[str, Any]:
         """What decides the output: per item its files' content and its facts; the mesh's content for the whole."""
         items: dict[str, Any] = {}
+        together = digest_of([hash_file(path) for path in files]) if (files := self.inventory.decided_by) else None
         for id, shot in self.shots.items():
             facts = {
                 "files": [hash_file(path) for path in (shot.image, shot.mask) if path is not None],
@@ -216,10 +256,17 @@ class FolderSource:
                 "said": [self.splits[id], shot.time, shot.name, shot.meta],
                 "fault": shot.fault and [shot.fault.reason, shot.fault.detail],
             }
-            items[id] = digest_of(facts)
+            rarer = {
+                "outlines": shot.outlines,
+                "backdrop": _plain(shot.backdrop),
+                "all": together,
+            }  # left out where there are none
+            items[id] = digest_of(facts | {name: value for name, value in rarer.items() if value})
         for id, it in self.sets.items():
-            items[id] = hash_file(it.file)
-        mesh = None if self.mesh_file is None else hash_file(self.mesh_file)
+            content = together if it.file is None else hash_file(it.file)
+            items[id] = content if it.facts is None else digest_of([content, it.facts])
+        tiles = [hash_file(path) for path in self.mesh_files]
+        mesh = tiles if len(tiles) > 1 else tiles[0] if tiles else None
         told = {"units": self.inventory.units, "up": _plain(self.inventory.up), "points": self.inventory.points}
         return {"items": items, "mesh": mesh, "told": told}
 
@@ -238,11 +285,18 @@ class FolderSource:
     def _check(self) -> None:
         if not self.shots:
             raise UserError(f"capture.path={str(self.root)!r} holds no frame")
-        if not any(shot.fault is None and self.splits[id] == "train" for id, shot in self.shots.items()):
-            faults = Counter(shot.fault.reason for shot in self.shots.values() if shot.fault is not None)
-            told = ", ".join(f"{number} {reason}" for reason, number in sorted(faults.items())) or "none is at fault"
-            first = next((f"; {shot.name}: {shot.fault.detail}" for shot in self.shots.values() if shot.fault is not None), "")
+        usable = [self.splits[id] for id, shot in self.shots.items() if shot.fault is None]
+        if "train" in usable and len(usable) >= FEWEST:
+            return
+        faults = Counter(shot.fault.reason for shot in self.shots.values() if shot.fault is not None)
+        told = ", ".join(f"{number} {reason}" for reason, number in sorted(faults.items())) or "none is at fault"
+        first = next((f"; {shot.name}: {shot.fault.detail}" for shot in self.shots.values() if shot.fault is not None), "")
+        if "train" not in usable:
             raise UserError(f"no training frame is usable ({len(self.shots)} frames: {told}{first})")
+        raise UserError(
+            f"{len(usable)} usable frames are too few, at least {FEWEST} are needed to learn from some and to test on others: "
+            f"take more images, or keep more of them (capture.every={self.config.every}; {told}{first})"
+        )
 
 
 def _plain(value: Any) -> Any:
@@ -267,11 +321,13 @@ def _ids(names: Iterable[str]) -> list[str]:
     return [FRAME + slug for slug in ids]
 
 
-def _mesh_file(config: FolderConfig, root: Path) -> Path | None:
+def _mesh_files(config: FolderConfig, root: Path) -> list[Path]:
+    """The mesh that the settings name, or that lies in the folder; a folder of tiles is one mesh."""
     if config.mesh is not None:
         path = Path(config.mesh).expanduser()
-        if not path.is_file():
-            raise UserError(f"capture.mesh={config.mesh!r} is not a file")
-        return path
+        tiles = sorted(tile for tile in path.rglob("*") if tile.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
+        if not tiles or not all(tile.is_file() for tile in tiles):
+            raise UserError(f"capture.mesh={config.mesh!r} is neither a mesh nor a folder of meshes ({', '.join(SUFFIXES)})")
+        return tiles
     beside = (root / f"mesh.{suffix}" for suffix in ("ply", "glb", "obj"))
-    return next((path for path in beside if path.is_file()), None)
+    return next(([path] for path in beside if path.is_file()), [])

@@ -15,8 +15,8 @@ from model.neuras.baked import Baked
 from pipeline.errors import UserError
 from pipeline.store import Artifact
 from stages.graphics.cameras import Camera
+from stages.graphics.casting import Caster, GBuffer
 from stages.neuras.baking import drawing
-from stages.neuras.rasterizing.casting import Caster, GBuffer
 from stages.neuras.rasterizing.footprints import footprint
 from stages.neuras.records import AtlasMesh, CaptureInfo, load_atlas
 

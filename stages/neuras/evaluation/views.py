@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from model.neuras.exposure import halves, matched
 from pipeline.errors import Reject
 from pipeline.store import Artifact
 from stages.graphics.metrics import SSIM_MIN_SIZE
@@ -25,13 +26,16 @@ CACHED = 8  # photos that a worker keeps for warping
 
 @dataclass(frozen=True, eq=False)
 class Examiner:
-    """Draws and measures views. drawings: the baked shader by texture format; empty without OpenGL."""
+    """Draws and measures views. drawings: the baked shader by texture format; empty without OpenGL. exposure: whether every
+    picture takes the photo's exposure, found on the left half, and is scored on the right half alone.
+    """
 
     reference: Reference
     drawings: Mapping[str, Drawing]
     warping: Warping
     scorers: Mapping[str, scores.Scorer]
     depth_tolerance: float
+    exposure: bool = False
 
     def examine(self, frame: FrameRecord) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """What is measured of the view, as plain JSON, and its pictures by name, (H, W, 3) uint8."""
@@ -43,6 +47,9 @@ class Examiner:
         pictures = {"ours": as_bytes(exact), "warping": as_bytes(warped)}
         if drawn:
             pictures["shader"] = as_bytes(drawn["fp16"])
+        if self.exposure:
+            known, counts = (counts & half for half in halves(counts.shape))
+            pictures = {name: matched(picture, photo, known) for name, picture in pictures.items()}
         errors = None
         if frame.depth is not None:
             depths = (seen.depth, frame.depth)

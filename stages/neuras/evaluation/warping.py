@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from stages.graphics.cameras import Camera
-from stages.neuras.rasterizing.casting import Caster, GBuffer
+from stages.graphics.casting import Caster, GBuffer
 
 TOLERANCE = 0.02  # relative difference of depth under which a source sees the same point
 FAR = 1e6  # in scene radii: where a pixel without a point is taken to lie

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.graphics.cameras import Camera
-from stages.neuras.rasterizing.casting import GBuffer
+from stages.graphics.casting import GBuffer
 from stages.neuras.records import AtlasMesh
 
 FINEST = -10.0  # a pixel that covers a thousandth of a texel's side

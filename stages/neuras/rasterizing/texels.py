@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from model.neuras.sampling import Pyramid
-from stages.neuras.rasterizing.casting import Caster
+from stages.graphics.casting import Caster
 from stages.neuras.records import AtlasMesh
 
 

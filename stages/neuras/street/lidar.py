@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.neuras.rasterizing.casting import Caster
+from stages.graphics.casting import Caster
 from stages.neuras.records import PointsRecord
 from stages.neuras.street.cameras import LANE, poses, start
 from stages.neuras.street.city import City

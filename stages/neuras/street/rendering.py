@@ -14,9 +14,9 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from stages.graphics.cameras import Camera
+from stages.graphics.casting import Caster
 from stages.graphics.denoising import denoise
 from stages.graphics.tonemap import srgb_decode, srgb_encode
-from stages.neuras.rasterizing.casting import Caster
 from stages.neuras.street.city import City, Group
 
 BOUNCES = 4  # segments of the longest path

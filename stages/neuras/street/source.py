@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.keys import seed_for
-from stages.neuras.rasterizing.casting import Caster
+from stages.graphics.casting import Caster
 from stages.neuras.records import CaptureInfo, FrameRecord, PointsRecord
 from stages.neuras.street import lidar
 from stages.neuras.street.cameras import poses

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from stages.graphics.cameras import Camera
-from stages.neuras.rasterizing.casting import Caster
+from stages.graphics.casting import Caster
 from stages.neuras.records import Mesh
 
 

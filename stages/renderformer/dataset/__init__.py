@@ -10,6 +10,9 @@ A batch holds, for B scenes padded to N triangles with V views of H x W pixels (
     the AOV layers asked for, (B, V, H, W, 3) or (B, V, H, W); direct is left out when lights are reweighted;
     patch_index (B, N) int32, -1 = constant, else into patches (T, 7, 32, 32) float16 of this batch: both only where
     a scene of the batch has textured triangles;
+    guide_* where they were asked for (``stages.renderformer.guides.records``): guide_light_triangles (B, L), -1 where a scene
+    has fewer; guide_triangle_seen (B, N, 4, L); guide_hit (B, V, H, W, 4) and the other fields of ViewGuides;
+    bundles (B, V, K) int64 where only some ray bundles were drawn: image and guides are then (B, V, K, side^2, ...);
     views (B, V) int64, camera index of each view; ids, B sample ids; damaged, (id, reason) of samples that were skipped.
 """
 
@@ -24,7 +27,7 @@ from stages.renderformer.dataset.augment import (
     move,
     rotation_from_vector,
 )
-from stages.renderformer.dataset.loader import BatchConfig, Batches, evaluation_samples, prefetch
+from stages.renderformer.dataset.loader import BatchConfig, Batches, Needs, evaluation_samples, prefetch
 from stages.renderformer.dataset.shards import DamagedSample, DamagedShard, Sample, ShardDataset, decode_members, decode_sample
 
 __all__ = [
@@ -33,6 +36,7 @@ __all__ = [
     "Batches",
     "DamagedSample",
     "DamagedShard",
+    "Needs",
     "Relight",
     "Sample",
     "ShardDataset",

@@ -7,7 +7,8 @@ coloured or turned off, and everything exposed longer; rigid motions and mirrors
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import dataclasses
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from pipeline.config import Section
 from pipeline.errors import UserError
 from stages.graphics.exr import copy_pixels
 from stages.renderformer.dataset.shards import Sample
+from stages.renderformer.guides import SceneGuides, ViewGuides
+from stages.renderformer.guides.records import mirrored_seen
 from stages.renderformer.records import SceneRecord
 from stages.renderformer.views import LAYERS
 
@@ -26,6 +29,10 @@ TRIANGLES = ("triangles", "vertex_normals", "diffuse", "specular", "roughness", 
 RADIANCE = ("image", "direct")  # what exposure scales
 PIXELS = ("image", *LAYERS)  # (V, H, W) or (V, H, W, 3)
 PATCHES = tuple(SceneRecord.PATCH_DTYPES)  # only in examples with textured triangles
+GUIDE = "guide_"  # begins the names of guides (``stages.renderformer.guides``), only in examples that were read with them
+LIGHT_TRIANGLES, TRIANGLE_SEEN = f"{GUIDE}light_triangles", f"{GUIDE}triangle_seen"
+PIXEL_GUIDES = tuple(f"{GUIDE}{field.name}" for field in dataclasses.fields(ViewGuides))
+LIGHTS_PADDED = (LIGHT_TRIANGLES, TRIANGLE_SEEN, f"{GUIDE}light_seen")  # their last axis counts a scene's emitting triangles
 
 
 class Relight(Section):
@@ -69,11 +76,39 @@ def make_example(sample: Sample, views: np.ndarray, factors: np.ndarray | None, 
                 if any(getattr(view, name) is None for view in chosen_views):
                     raise UserError(f"views of scene {scene.id} were read without layers: read them with layers=[{name!r}]")
                 example[name] = _stacked([getattr(view, name) for view in chosen_views])
+    if sample.guides is not None:
+        example |= scene_arrays(sample.guides) | view_arrays([sample.view_guides[int(view)] for view in views])
     if factors is not None:
         lit = scene.light_index >= 0
         example["emission"] = scene.emission.copy()
         example["emission"][lit] *= weights[scene.light_index[lit]]
     return example
+
+
+def scene_arrays(guides: SceneGuides) -> Batch:
+    """``guide_light_triangles`` (L,), ``guide_triangle_seen`` (N, 4, L)."""
+    return {LIGHT_TRIANGLES: guides.light_triangles, TRIANGLE_SEEN: guides.light_seen}
+
+
+def view_arrays(views: Sequence[ViewGuides]) -> Batch:
+    """Each field of `ViewGuides` after ``guide_``, (V, H, W, ...)."""
+    return {f"{GUIDE}{name}": np.stack([getattr(view, name) for view in views]) for name in vars(views[0])}
+
+
+def take_bundles(example: Batch, chosen: np.ndarray, side: int) -> Batch:
+    """The example with some ray bundles of its views only: images and guides become (V, K, side^2, ...).
+
+    chosen: (V, K) numbers of bundles of side x side pixels, row by row; kept as ``bundles``.
+    """
+
+    def take(pixels: np.ndarray) -> np.ndarray:
+        views, height, width, *rest = pixels.shape
+        grid = pixels.reshape(views, height // side, side, width // side, side, *rest).swapaxes(2, 3)
+        bundles = grid.reshape(views, -1, side * side, *rest)
+        return np.stack([view[rows] for view, rows in zip(bundles, chosen, strict=True)])
+
+    per_pixel = [name for name in example if name in PIXELS or name in PIXEL_GUIDES]
+    return {**example, **{name: take(example[name]) for name in per_pixel}, "bundles": chosen}
 
 
 def lit_by(lights: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -147,6 +182,7 @@ def mirror(example: Batch) -> Batch:
         # The mirrored camera would be left-handed: turn its x axis round and the image with it.
         "camera_to_world": flip @ example["camera_to_world"] @ flip,
         **{name: example[name][:, :, ::-1] for name in PIXELS if name in example},
+        **_mirrored_guides(example),
     }
     if "normal" in out:
         out["normal"] = out["normal"].copy("K")
@@ -158,6 +194,16 @@ def mirror(example: Batch) -> Batch:
     return out
 
 
+def _mirrored_guides(example: Batch) -> Batch:
+    if TRIANGLE_SEEN not in example:
+        return {}
+    fields = [field.name for field in dataclasses.fields(ViewGuides)]
+    views = zip(*(example[f"{GUIDE}{name}"] for name in fields), strict=True)
+    mirrored = [ViewGuides(*view).mirrored() for view in views]
+    scene = SceneGuides(example[LIGHT_TRIANGLES], mirrored_seen(example[TRIANGLE_SEEN]))
+    return scene_arrays(scene) | view_arrays(mirrored)
+
+
 def planes(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """An array (.., V, H, W) or (.., V, H, W, 3) for pixels. In memory colours are planes, as they are in the file."""
     if shape[-1] != 3:
@@ -166,7 +212,7 @@ def planes(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def collate(examples: Iterable[Batch], count: int) -> Batch:
-    """``count`` examples stacked; triangles padded with zeros to the longest.
+    """``count`` examples stacked; triangles padded with zeros to the longest, lights of guides with -1.
 
     A generator is asked for one example after the other, whose pixels are copied and let go before the next one's are decoded:
     memory used again at once costs far less than fresh memory.
@@ -201,6 +247,11 @@ def collate(examples: Iterable[Batch], count: int) -> Batch:
             batch[name] = np.zeros((count, longest, *arrays[0].shape[1:]), arrays[0].dtype)
             for row, array in zip(batch[name], arrays, strict=True):
                 row[: len(array)] = array
+        elif name in LIGHTS_PADDED:
+            shape = np.max([array.shape for array in arrays], axis=0)
+            batch[name] = np.full((count, *shape), -1 if name == LIGHT_TRIANGLES else 0, arrays[0].dtype)
+            for row, array in zip(batch[name], arrays, strict=True):
+                row[tuple(slice(0, size) for size in array.shape)] = array
         else:
             batch[name] = np.stack(arrays)
     return batch

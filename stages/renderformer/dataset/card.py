@@ -28,6 +28,7 @@ from stages.renderformer.dataset.distributions import (
     split_order,
 )
 from stages.renderformer.dataset.encoding import READ
+from stages.renderformer.guides.records import SCENE_MEMBER
 
 TITLE = "Dataset card"
 SAMPLED = 1000  # scenes per split that distributions are drawn from
@@ -76,6 +77,20 @@ VIEW_MEMBERS = (
     ("meta.json", "render", "JSON", "JSON", "per camera: status, mean radiance, spp, error (estimated), clamped values, noise"),
     ("meta.json", "crc32", "JSON", "int", "CRC-32 of each other member"),
 )  # fmt: skip
+GUIDE_MEMBERS = (
+    ("guides.npz", "light_triangles", "(E,)", "int32", "rows of faces that emit"),
+    ("guides.npz", "light_seen", "(F, 4, E)", "bits", "whether a point of the triangle sees a point of the light; points 0 to "
+     "2 have weight 2/3 of their corner and 1/6 of the others, point 3 is the centroid; packed along the last axis"),
+    ("view<i>.guides.npz", "hit", "(H, W, 4)", "uint16/32", "row of faces + 1 that the pixel's rays hit, 2 x 2 row by row, "
+     "0 = nothing; camera rays pass through lights"),
+    ("view<i>.guides.npz", "main", "(H, W)", "int8", "0..3, the first of these rays that hits something, -1 where none does"),
+    ("view<i>.guides.npz", "mirror", "(H, W)", "uint16/32", "what the mirror reflection of the ray `main` hits"),
+    ("view<i>.guides.npz", "lobe", "(H, W, 4)", "uint16/32", "what a reflection of each hits, drawn from its GGX lobe"),
+    ("view<i>.guides.npz", "hit_weights, ..", "(.., 2)", "uint8", "of each of the three: barycentric weights of corner 1 and 2 "
+     "of the triangle that is hit, * 255"),
+    ("view<i>.guides.npz", "light_seen", "(H, W, 4, E)", "bits", "whether each hit sees a point of each emitting triangle"),
+    ("view<i>.guides.npz", "lights", "()", "int32", "E, the emitting triangles"),
+)  # fmt: skip
 
 
 WEBDATASET = """
@@ -95,6 +110,7 @@ class Dataset:
 
     by_split: the samples of each split. shards, objects: shards.json and objects.json, by split. measured: quantities of some
     scenes of each split. preimages: what decided each stage's artifact, by stage. key: the shard artifact's.
+    guide_bytes: of the guides of a scene and of a view, in the mean; None where there are none.
     """
 
     by_split: Mapping[str, Rows]
@@ -103,6 +119,7 @@ class Dataset:
     measured: Mapping[str, Quantities]
     preimages: Mapping[str, Any]
     key: str
+    guide_bytes: tuple[float, float] | None = None
 
     @property
     def splits(self) -> list[str]:
@@ -138,14 +155,19 @@ def read_dataset(inputs: Mapping[str, Any], draft: Any) -> Dataset:
     from pipeline.store import history
 
     by_split: dict[str, list[dict[str, Any]]] = {}
+    sizes: dict[str, list[int]] = {}  # of guides, by member; those of all views together
     with open(draft.files / "index.jsonl", encoding="utf-8") as file:
         for line in file:
-            sample = {name: value for name, value in json.loads(line).items() if name != "members"}
+            sample = json.loads(line)
+            for name, (_, size, _) in sample.pop("members").items():
+                if name.endswith(SCENE_MEMBER):
+                    sizes.setdefault(name.removeprefix(SCENE_MEMBER) and "view", []).append(size)
             by_split.setdefault(sample["split"], []).append(sample)
     shards, objects = (json.loads((draft.files / f"{name}.json").read_text()) for name in ("shards", "objects"))
     measured = {split: measure_scenes(draft, rows[:: -(-len(rows) // SAMPLED)]) for split, rows in by_split.items()}
     preimages = {**dict(reversed(history(inputs).items())), "shard": draft.preimage}
-    return Dataset(by_split, shards, objects, measured, preimages, draft.key)
+    guide_bytes = (float(np.mean(sizes[""])), float(np.mean(sizes["view"]))) if sizes else None
+    return Dataset(by_split, shards, objects, measured, preimages, draft.key, guide_bytes)
 
 
 def to_markdown(dataset: Dataset) -> str:
@@ -247,9 +269,20 @@ def sections(dataset: Dataset, distributions: Sequence[Block]) -> list[Section]:
 
 def field_blocks(dataset: Dataset) -> list[Block]:
     fields = [("scene.npz", *row) for row in SCENE_FIELDS] + [*VIEW_MEMBERS]
+    guides = []
+    if dataset.guide_bytes:
+        fields += GUIDE_MEMBERS
+        scene_bytes, view_bytes = dataset.guide_bytes
+        guides = [
+            Text(
+                f"Guides say what ray casting alone finds; they hold no light. They take {scene_bytes:,.0f} bytes a scene and "
+                f"{view_bytes:,.0f} bytes a view, in the mean."
+            )
+        ]
     rows = [[*(Cell(name, kind="code") for name in names), meaning] for *names, meaning in fields]
     return [
         Table(("member", "field", "shape", "dtype", "unit, frame, range"), rows),
+        *guides,
         Text(
             "`scene.npz` read with numpy alone, a row per triangle, float32 (error of a vertex at most scale / 2 an axis, "
             "of a normal 3e-5, of a material 2.5e-4):"

@@ -42,6 +42,8 @@ def write_hdf5(path: Path, scene: SceneRecord) -> None:
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         for name, array in released_arrays(scene).items():
             file.create_dataset(name, data=array, compression="gzip", compression_opts=9)
+        if "aspect" in scene.meta:  # of pictures that are not square; other readers pass over it
+            file["fov"].attrs["aspect"] = scene.meta["aspect"]
 
 
 def export(source: Any, out: Path, splits: list[str] | None = None, images: bool = False) -> Iterator[Path]:

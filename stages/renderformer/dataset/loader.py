@@ -12,6 +12,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from stages.renderformer.dataset.augment import (
     mirror,
     move,
     rotation_from_vector,
+    take_bundles,
 )
 from stages.renderformer.dataset.shards import DamagedSample, ShardDataset
 from stages.renderformer.views import LAYERS
@@ -51,22 +53,35 @@ class BatchConfig(Section):
     exposure_stops: float = added(0.0, 0.0, ge=0)  # radiance, seen and emitted, times 2^U(-stops, stops)
     shuffle_shards: int = added(0, 0, ge=0)  # scenes are shuffled over this many shards at a time; 0: over the whole split
     bucket: int = added(0, 0, ge=0)  # global batches whose scenes are sorted by triangle count together; 0: none
+    bundles_per_view: int = added(0, 0, ge=0)  # ray bundles of a view that a step learns from; 0: all
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a network reads besides the scenes and their images.
+
+    guides: what ray casting says of scene and views. layers: AOV layers. bundle: pixels along a ray bundle's side.
+    """
+
+    guides: bool = False
+    layers: tuple[str, ...] = ()
+    bundle: int = 8
 
 
 class Batches:
     """``batches(step)``: the batch of a step. Rank r of ``world`` gets its slice of the same global batch.
 
-    ``layers``: the AOV layers that a batch holds besides the image; only then are they read.
+    ``needs``: what a batch holds besides the image; only then is it read.
     """
 
-    def __init__(self, dataset: ShardDataset, config: BatchConfig, rank: int = 0, world: int = 1, layers: tuple[str, ...] = ()):
-        if unknown := set(layers) - LAYERS.keys():
+    def __init__(self, dataset: ShardDataset, config: BatchConfig, rank: int = 0, world: int = 1, needs: Needs = Needs()):
+        if unknown := set(needs.layers) - LAYERS.keys():
             raise UserError(f"layers {', '.join(sorted(unknown))} are unknown: choose from {', '.join(LAYERS)}")
         if config.batch_scenes % world:
             raise UserError(
                 f"batch_scenes={config.batch_scenes} cannot be shared by {world} processes: make it a multiple of {world}"
             )
-        self.dataset, self.config, self.rank, self.world, self.layers = dataset, config, rank, world, layers
+        self.dataset, self.config, self.rank, self.world, self.needs = dataset, config, rank, world, needs
         self._orders: dict[int, np.ndarray] = {}
         self._lock = threading.Lock()
 
@@ -146,9 +161,9 @@ class Batches:
         rng = np.random.default_rng(seed_for(config.seed, "augment", f"{epoch}/{row['id']}"))
         kept_views, view_count = np.array(row["views"]), config.views_per_scene
         views = rng.choice(kept_views, size=view_count, replace=view_count > len(kept_views))
-        sample = self.dataset.read(index, views, self.layers, None)
+        sample = self.dataset.read(index, views, self.needs.layers, None, self.needs.guides)
         factors = draw_light_factors(config.lighting, rng, sample.scene.n_lights) if config.relight else None
-        example = make_example(sample, views, factors, self.layers)
+        example = make_example(sample, views, factors, self.needs.layers)
         if config.mirror and rng.random() < 0.5:
             example = mirror(example)
         if config.rotate or config.translate_sigma:
@@ -156,13 +171,18 @@ class Batches:
             example = move(example, rotation_from_vector(vector), rng.normal(size=3) * config.translate_sigma)
         if config.exposure_stops:
             example = expose(example, 2.0 ** rng.uniform(-config.exposure_stops, config.exposure_stops))
+        if config.bundles_per_view:
+            total = (self.dataset.resolution // self.needs.bundle) ** 2
+            count = min(config.bundles_per_view, total)
+            chosen = np.stack([np.sort(rng.choice(total, count, replace=False)) for _ in views])
+            example = take_bundles(example, chosen, self.needs.bundle)
         return example
 
 
-def evaluation_samples(dataset: ShardDataset) -> Iterator[Batch]:
-    """One scene at a time with all its kept views, exactly as stored, and the direct light beside it."""
+def evaluation_samples(dataset: ShardDataset, guides: bool = False) -> Iterator[Batch]:
+    """One scene at a time with all its kept views, exactly as stored, and the direct light beside it; guides if wanted."""
     for index in range(len(dataset)):
-        sample = dataset.read(index, layers=("direct",))
+        sample = dataset.read(index, layers=("direct",), guides=guides)
         yield collate([make_example(sample, np.array(sorted(sample.views)), None, ("direct",))], 1)
 
 

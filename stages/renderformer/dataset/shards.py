@@ -18,8 +18,8 @@ import re
 import threading
 import zlib
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,8 @@ from pipeline.errors import UserError
 from pipeline.store import RECORD_ID
 from stages.graphics.exr import decode_lights
 from stages.renderformer.dataset.encoding import decode_scene
+from stages.renderformer.guides import SceneGuides, ViewGuides, guide_member
+from stages.renderformer.guides.records import SCENE_MEMBER, check_guides, decode_scene_guides, decode_view_guides
 from stages.renderformer.records import SceneRecord, ViewRecord
 from stages.renderformer.views import LAYERS, decode_layers, view_members
 
@@ -50,11 +52,13 @@ class DamagedShard(UserError):
 class Sample:
     """One scene with the views that were asked for; treat as read only, the cache shares its arrays.
 
-    AOV layers that were not asked for are None.
+    AOV layers that were not asked for are None, and so are guides.
     """
 
     scene: SceneRecord
     views: dict[int, ViewRecord]  # camera index -> what it saw
+    guides: SceneGuides | None = None
+    view_guides: dict[int, ViewGuides] = field(default_factory=dict)  # by camera index
 
 
 def _view(lights: np.ndarray, meta: dict[str, Any], layers: Mapping[str, np.ndarray]) -> ViewRecord:
@@ -259,9 +263,14 @@ class ShardDataset:
         return row
 
     def read(
-        self, index: int, views: Sequence[int] | None = None, layers: Sequence[str] = (), dtype: type | None = np.float32
+        self,
+        index: int,
+        views: Sequence[int] | None = None,
+        layers: Sequence[str] = (),
+        dtype: type | None = np.float32,
+        guides: bool = False,
     ) -> Sample:
-        """The sample with these views (None: all), their lights, and their AOVs if any ``layers`` are wanted;
+        """The sample with these views (None: all), their lights, their AOVs if any ``layers`` are wanted, and its guides;
         ``dtype`` None: half floats, as stored."""
         row = self.row(index)
         chosen_views = row["views"] if views is None else sorted({int(view) for view in views})
@@ -276,7 +285,19 @@ class ShardDataset:
                 if layers:
                     layer_images = self._cached((index, aov, dtype), lambda n=aov, w=where: decode_layers(reader[n], w, dtype))
                 out[view] = _view(lights, meta, layer_images)
-        return Sample(scene, out)
+            sample = Sample(scene, out)
+            if guides:
+                self._add_guides(sample, index, reader)
+        return sample
+
+    def _add_guides(self, sample: Sample, index: int, reader: Reader) -> None:
+        def read(name: str, decode: Callable[[bytes, str], Any]) -> Any:
+            return self._cached((index, name), lambda: decode(reader[name], f"{name} of {sample.scene.id}"))
+
+        sample.guides = read(SCENE_MEMBER, decode_scene_guides)
+        for view in sample.views:
+            sample.view_guides[view] = read(guide_member(view), decode_view_guides)
+        check_guides(len(sample.scene.triangles), sample.guides, sample.view_guides.values())
 
     def _cached(self, key: tuple, decode: Any) -> Any:
         with self._lock:
@@ -297,6 +318,11 @@ class ShardDataset:
                 while self._used > self.cache_bytes:
                     self._used -= self._cache.popitem(last=False)[1][1]
         return value
+
+    @property
+    def guided(self) -> bool:
+        """Whether the samples hold guides."""
+        return SCENE_MEMBER in self.row(0)["members"]
 
     def _shard_sizes(self, shards: Mapping[str, int]) -> dict[str, int]:
         """Bytes of each shard; those on this disk are compared with what is there."""
@@ -371,7 +397,7 @@ class Reader:
 def _nbytes(value: Any) -> int:
     if isinstance(value, np.ndarray):
         return value.nbytes
-    if isinstance(value, SceneRecord):
+    if isinstance(value, (SceneRecord, SceneGuides, ViewGuides)):
         value = vars(value)
     parts = value.values() if isinstance(value, dict) else value
     return sum(part.nbytes for part in parts if isinstance(part, np.ndarray))

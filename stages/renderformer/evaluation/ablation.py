@@ -76,7 +76,7 @@ PAPER = {
 
 
 def tables() -> list[str]:
-    return sorted(path.name for path in (CONF / "renderformer" / "experiment").iterdir() if path.is_dir())
+    return sorted(path.name for path in (CONF / "renderformer" / "experiment").glob("table1*") if path.is_dir())
 
 
 def jobs_of(table: str, names: Sequence[str] | None, overrides: Sequence[str]) -> dict[str, Job]:

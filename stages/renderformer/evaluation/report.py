@@ -20,8 +20,9 @@ from stages.graphics.page import Cell, Picture, Table, embed, png, render
 from stages.graphics.statistics import BREAKDOWNS, decided, worst_first
 from stages.graphics.tonemap import exposure_for, to_picture
 from stages.renderformer.evaluation import plots, tables
+from stages.renderformer.evaluation.regions import REGIONS
 from stages.renderformer.evaluation.runs import Images, Probe, Run
-from stages.renderformer.evaluation.timing import PER_IMAGE, STEPS
+from stages.renderformer.evaluation.timing import steps_of
 from stages.renderformer.inference.compare import DIFFERENCE_GAIN, error_pictures
 
 OVERVIEW_VIEWS = 10  # columns of overview.png
@@ -168,24 +169,29 @@ def breakdown_table(run: Run, key: str, several: bool) -> Table:
 
 def timing_table(runs: Sequence[Run]) -> Table:
     """Median milliseconds of every step and of their sums, with a bar for each."""
+    steps = dict(steps_of([run.timing for run in runs if run.timing]))
+    per_image = [name for name, step in steps.items() if step.per_image]
+    per_scene = [name for name, step in steps.items() if not step.per_image]
 
-    def milliseconds(run: Run, steps: Iterable[str]) -> float:
-        return 1000 * sum(run.timing["median"][step] for step in steps)
+    def milliseconds(run: Run, names: Iterable[str]) -> float | None:
+        """None where the run has none of these steps, or no times."""
+        median = run.timing["median"] if run.timing else {}
+        times = [median[name] for name in names if name in median]
+        return 1000 * sum(times) if times else None
 
-    per_scene = [step for step in STEPS if step not in PER_IMAGE]
-    longest = max(milliseconds(run, STEPS) for run in runs if run.timing)
+    longest = max(milliseconds(run, steps) or 0 for run in runs)
 
-    def cells(steps: Iterable[str], kind: str = "") -> list[Cell | None]:
-        times = [milliseconds(run, steps) if run.timing else None for run in runs]
+    def cells(names: Iterable[str], kind: str = "") -> list[Cell | None]:
+        times = [milliseconds(run, names) for run in runs]
         return [
             None if ms is None else Cell(f"{ms:.1f}", kind=kind, colour=plots.colour(number), share=ms / longest)
             for number, ms in enumerate(times)
         ]
 
-    shares = [f"{100 * milliseconds(run, per_scene) / milliseconds(run, STEPS):.0f} %" if run.timing else None for run in runs]
-    rows = [[label, *cells([step])] for step, label in STEPS.items()]
-    rows.append([Cell("first image of a scene", kind="strong"), *cells(STEPS, "strong")])
-    rows.append([Cell("every further image", kind="strong"), *cells(PER_IMAGE, "strong")])
+    shares = [f"{100 * milliseconds(run, per_scene) / milliseconds(run, steps):.0f} %" if run.timing else None for run in runs]
+    rows = [[step.label, *cells([name])] for name, step in steps.items()]
+    rows.append([Cell("first image of a scene", kind="strong"), *cells(steps, "strong")])
+    rows.append([Cell("every further image", kind="strong"), *cells(per_image, "strong")])
     rows.append(["share of the per-scene part in the first", *shares])
     return Table(["milliseconds", *run_headings(runs, "model")], rows, numeric=True)
 
@@ -248,6 +254,8 @@ def run_values(runs: Sequence[Run], limit: int) -> dict[str, Any]:
         "breakdowns": BREAKDOWNS,
         "breakdown_plots": [plots.breakdowns(named, metrics[name], same) for name in ("psnr", "log_error", "flip")],
         "breakdown_tables": breakdown_tables(runs),
+        "regions": tables.region_table(runs),
+        "region_notes": REGIONS,
         "timing": timing_table(runs) if any(run.timing for run in runs) else None,
         "timing_notes": [(run.name, timing_note(run.timing)) for run in runs if run.timing],
         "views": views,

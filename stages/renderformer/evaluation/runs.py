@@ -16,7 +16,7 @@ from pipeline.store import history, store_of
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Draft
 
-VERSION = 3  # of stage evaluate: what the artifacts that are read here hold
+VERSION = 4  # of stage evaluate: what the artifacts that are read here hold
 PROBE_FIELDS = ("name", "title", "question", "setting", "model", "columns", "rows", "notes")  # of probe.json
 CONFIGS = ("collect", "scene", "render", "train", "evaluate")  # stages whose settings the page shows
 
@@ -138,8 +138,7 @@ def facts(summary: Mapping[str, Any], key: str) -> dict[str, str]:
     resolution = summary["per_scene"][0]["resolution"]
     trained = "a given checkpoint" if train["steps"] is None else f"{train['steps']:,} training steps"
     return {
-        "model": f"{train['layers']} + {train['view_layers']} layers, width {train['width']}, "
-        f"{train['parameters']:,} parameters, {trained}",
+        "model": f"{train['network']}, {train['parameters']:,} parameters, {trained}",
         "data": f"{counts} scenes at {resolution}×{resolution} pixels; evaluated here: {data['split']}",
         **({} if "train" in data["scenes"] else {"mean training image": "of the evaluated scenes: there are no others"}),
         "train artifact": train["key"][:12],

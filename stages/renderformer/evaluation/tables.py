@@ -6,8 +6,10 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from stages.graphics.metrics import METRICS, Metric, named
+from stages.graphics.page import Cell, Table
 from stages.graphics.page.markdown import table
 from stages.graphics.statistics import BARS, JUDGED, METHODS, Estimate, decided, difference, with_interval
+from stages.renderformer.evaluation.regions import REGIONS
 from stages.renderformer.evaluation.runs import Probe, Run
 
 CEILING = "ceiling: noise of the ground truth"
@@ -74,7 +76,9 @@ def columns(runs: Sequence[Run]) -> list[dict[str, Any]]:
             continue
         distinct: list[tuple[dict[str, Any], list[str]]] = []  # values of the metrics, and the runs that have them
         for run in runs:
-            values = run.summary["ceiling"] if method == "ceiling" else run.summary["methods"][method]
+            values = run.summary["ceiling"] if method == "ceiling" else run.summary["methods"].get(method)
+            if values is None:
+                continue
             for other, names in distinct:
                 if all(other.get(name, value) == value for name, value in values.items()):
                     other |= values
@@ -84,7 +88,8 @@ def columns(runs: Sequence[Run]) -> list[dict[str, Any]]:
                 distinct.append((dict(values), [run.name]))
         kind = "bar" if method in BARS else method
         for values, names in distinct:
-            suffix = "" if len(distinct) == 1 else f", {', '.join(names)}"
+            everywhere = len(distinct) == 1 and (len(names) == len(runs) or method != "closed_form")
+            suffix = "" if everywhere else f", {', '.join(names)}"
             out.append({"label": label + suffix, "kind": kind, "values": values})
     return out
 
@@ -131,6 +136,26 @@ def unlike(runs: Sequence[Run]) -> dict[str, list[str]]:
     names = dict.fromkeys(name for facts in flat for name in facts)
     rows = {name: [facts.get(name, "–") for facts in flat] for name in names}
     return {name: values for name, values in rows.items() if len(set(values)) > 1}
+
+
+def region_table(runs: Sequence[Run]) -> Table:
+    """Mean log error of every region, with its part of the whole; by run, and for the first also of what it is seen against."""
+    metric = METRICS["log_error"]
+    first = runs[0].summary["regions"]
+    against = [method for method in METHODS if method != "model" and method in first[0]["error"]]
+    columns = [(METHODS["model"] if len(runs) == 1 else run.name, run.summary["regions"], "model") for run in runs]
+    columns += [(METHODS[method], first, method) for method in against]
+    rows = []
+    for name in REGIONS:
+        cells: list[Cell | str | None] = []
+        for _, regions, method in columns:
+            row = next((row for row in regions if row["region"] == name), None)
+            cell = row and Cell(metric.format(row["error"][method]), f"{row['part'][method]:.0%} of the error")
+            cells.append(cell)
+        if any(cells):
+            share = next(row["share"] for _, regions, _ in columns for row in regions if row["region"] == name)
+            rows.append([name, f"{share:.0%}", *cells])
+    return Table(["region", "pixels", *(label for label, _, _ in columns)], rows, numeric=True)
 
 
 def markdown(summary: Mapping[str, Any]) -> str:

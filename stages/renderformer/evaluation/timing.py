@@ -6,50 +6,104 @@ Times are measured, so they are no part of records, digests or keys. One image a
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from model.renderformer.network import RenderFormer
+    from model.renderformer.base import Network
     from stages.renderformer.dataset import Sample
+    from stages.renderformer.records import SceneRecord
 
 REPEATS = 3
-STEPS: Mapping[str, str] = {  # of a forward pass; reading the arrays is left out
-    "encode": "view-independent stage, per scene",
-    "project": "keys and values for the rays, per scene",
-    "rays": "view-dependent layers, per image",
-    "head": "decoding to pixels, per image",
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of a picture; once per image, or once per scene."""
+
+    label: str
+    per_image: bool
+
+
+# Reading the arrays is left out. RenderFormer's steps first, then those of a guided network, which shares none.
+STEPS: Mapping[str, Step] = {
+    "encode": Step("view-independent stage, per scene", False),
+    "project": Step("keys and values for the rays, per scene", False),
+    "rays": Step("view-dependent layers, per image", True),
+    "head": Step("decoding to pixels, per image", True),
+    "cast_scene": Step("casting visibility of lights, per scene", False),
+    "guided_encode": Step("closed forms and tokens of triangles, per scene", False),
+    "cast_view": Step("casting hits, reflections and shadows, per image", True),
+    "guided_decode": Step("closed forms and network of pixels, per image", True),
 }
-PER_IMAGE = ("rays", "head")
 
 
-def time_model(model: RenderFormer, samples: Sequence[Sample], device: str) -> dict[str, Any]:
+def time_model(model: Network, samples: Sequence[Sample], device: str) -> dict[str, Any]:
     """Seconds by step for the first view of each sample: ``scenes``, a row for each, and their ``median``.
 
     Beside them what they depend on: ``device``, ``threads``, ``resolution``, ``repeats``.
     """
     import torch
 
-    from model.renderformer.timing import time_steps
-    from stages.renderformer.dataset import collate, make_example
-
     model = model.to(device).eval()
+    resolution = next(iter(samples[0].views.values())).image.shape[0]
+    time_one = guided_seconds if model.reads_guides else renderformer_seconds
     rows = []
     for sample in samples:
-        batch = collate([make_example(sample, list(sample.views)[:1], None)], 1)
-        seconds = time_steps(model, batch, batch["image"].shape[2:4], device, REPEATS)
+        seconds = time_one(model, sample.scene, next(iter(sample.views)), resolution, device)
         row = {"id": sample.scene.id, "triangles": len(sample.scene.triangles)}
-        rows.append(row | {step: round(seconds[step], 6) for step in STEPS})
+        rows.append(row | {step: round(value, 6) for step, value in seconds.items()})
+    steps = [step for step in STEPS if step in rows[0]]
     return {
         "device": torch.cuda.get_device_name() if device == "cuda" else processor_name(),
         "threads": None if device == "cuda" else torch.get_num_threads(),
-        "resolution": next(iter(samples[0].views.values())).image.shape[0],
+        "resolution": resolution,
         "repeats": REPEATS,
         "scenes": rows,
-        "median": {step: round(median(row[step] for row in rows), 6) for step in STEPS},
+        "median": {step: round(median(row[step] for row in rows), 6) for step in steps},
     }
+
+
+def renderformer_seconds(model: Any, scene: SceneRecord, view: int, resolution: int, device: str) -> dict[str, float]:
+    from model.renderformer.timing import time_steps
+    from stages.renderformer.inference.predict import camera_arrays, padded_arrays
+
+    seconds = time_steps(model, padded_arrays(scene) | camera_arrays(scene, view), resolution, device, REPEATS)
+    return {name: value for name, value in seconds.items() if name in STEPS}
+
+
+def guided_seconds(model: Any, scene: SceneRecord, view: int, resolution: int, device: str) -> dict[str, float]:
+    """Rays are cast on one thread of the CPU, whatever the device."""
+    import torch
+
+    from model.renderformer.guided.inputs import Scenes
+    from model.renderformer.guided.network import Pixels
+    from model.timing import fastest
+    from stages.renderformer.dataset.augment import scene_arrays, view_arrays
+    from stages.renderformer.guides import GuideCaster
+    from stages.renderformer.inference.predict import batched, camera_arrays, padded_arrays
+
+    caster = GuideCaster(scene)
+    batch = padded_arrays(scene) | batched(scene_arrays(caster.scene_guides()))
+    cast = caster.view_guides(view, resolution, resolution)
+    with torch.inference_mode():
+        scenes = Scenes.read(batch, device)
+        encoded = model.encode(scenes)
+        pixels = Pixels.read(camera_arrays(scene, view) | batched(view_arrays([cast])), scenes, model.config.bundle)
+        return {
+            "cast_scene": fastest(lambda: GuideCaster(scene).scene_guides(), "cpu", REPEATS),
+            "guided_encode": fastest(lambda: model.encode(scenes), device, REPEATS),
+            "cast_view": fastest(lambda: caster.view_guides(view, resolution, resolution), "cpu", REPEATS),
+            "guided_decode": fastest(lambda: model.decode(encoded, pixels), device, REPEATS),
+        }
+
+
+def steps_of(timings: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, Step]]:
+    """The steps that any of the timings has, in order."""
+    yield from ((name, step) for name, step in STEPS.items() if any(name in timing["median"] for timing in timings))
 
 
 def processor_name() -> str:

@@ -152,7 +152,7 @@ def compare_scene(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         predicted = renderer.render(scene, view, settings.resolution, settings.composite_lights)
-    (traced,) = render_views(scene, RenderSettings(len(predicted), spp), choose("auto"), [view])
+    (traced,) = render_views(scene, RenderSettings(predicted.shape[:2], spp), choose("auto"), [view])
     names = (
         f"{path}, view {view}, path traced, {traced.meta['spp']} samples per pixel, denoised",
         "the model that ships" if renderer.folder == PRETRAINED else str(renderer.folder),

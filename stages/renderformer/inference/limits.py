@@ -10,9 +10,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from stages.renderformer.inference.room import LARGEST_TRIANGLE
 from stages.renderformer.records import SceneRecord
-from stages.renderformer.scenes.laws import CameraLaw, LightLaw, MaterialLaw
+from stages.renderformer.scenes.laws import LARGEST_TRIANGLE, CameraLaw, LightLaw, MaterialLaw
 from stages.renderformer.scenes.meshes import areas
 
 RELEASED_TRIANGLES = 4096  # of the released training data, for checkpoints that do not say (section 2)

@@ -44,6 +44,8 @@ def orbit(scene: SceneRecord, frames: int, view: int = 0, arc_deg: float | None 
         turns = middle + half * np.sin(phase - np.arcsin(middle / half))
     poses = np.stack([turned(pose, pivot, turn) for turn in turns])
     fov_deg, meta = np.repeat(scene.fov_deg[view], frames), {**scene.meta, "notes": notes}
+    if "aspect" in meta:
+        meta["aspect"] = [meta["aspect"][view]] * frames
     return replace(scene, camera_to_world=poses.astype(np.float32), fov_deg=fov_deg, meta=meta)
 
 

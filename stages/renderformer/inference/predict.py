@@ -1,55 +1,74 @@
 """Scenes to images by a trained network. *evaluate*, the probes and ``stages.renderformer.inference.renderer`` share it.
 
-Reads a released-format checkpoint folder and scene records, gives linear HDR images. One design choice: a scene is encoded
+Reads a checkpoint folder and scene records, gives linear HDR images. One design choice: a scene is encoded
 once, and its views are decoded from the same tokens a few at a time (section 3.1). So memory does not grow with the views.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stages.renderformer.dataset.augment import scene_arrays, view_arrays
+from stages.renderformer.guides import GuideCaster
 from stages.renderformer.inference.limits import light_radiance
 
 if TYPE_CHECKING:
-    from model.renderformer.network import RenderFormer
+    from model.renderformer.base import Network
     from stages.renderformer.records import SceneRecord
 
 
-def load_model(folder: Path) -> RenderFormer:
-    """The network of a released-format checkpoint folder, in eval mode on the CPU."""
+def load_model(folder: Path) -> Network:
+    """The network of a checkpoint folder, in eval mode on the CPU."""
     from model.renderformer import checkpoint
 
     return checkpoint.load(folder)[0]
 
 
 def predict_frames(
-    model: RenderFormer, scene: SceneRecord, views: Sequence[int], resolution: int | tuple[int, int], device: Any = "cpu"
+    model: Network, scene: SceneRecord, views: Sequence[int], resolution: int | tuple[int, int], device: Any = "cpu"
 ) -> Iterator[np.ndarray]:
     """(H, W, 3) float32 linear radiance, at least 0, of each of the scene's cameras ``views``, in order."""
-    import torch
-
     from model.renderformer.network import to_radiance
 
+    batch = padded_arrays(scene)
+    size = (resolution, resolution) if isinstance(resolution, int) else resolution
+    caster = GuideCaster(scene) if model.reads_guides else None
+    if caster is not None:
+        batch |= batched(scene_arrays(caster.scene_guides()))
+
+    def seen_by(view: int) -> dict[str, np.ndarray]:
+        guides = {} if caster is None else batched(view_arrays([caster.view_guides(view, *size)]))
+        return camera_arrays(scene, view) | guides
+
+    for y in model.to(device).eval().frames(batch, map(seen_by, views), size, device):
+        yield to_radiance(y).clamp(min=0).cpu().numpy()  # the network may undershoot 0 by a thousandth
+
+
+def batched(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """As a batch of one holds them."""
+    return {name: array[None] for name, array in arrays.items()}
+
+
+def padded_arrays(scene: SceneRecord) -> dict[str, np.ndarray]:
+    """The scene as a batch of one holds it, without cameras and images."""
     arrays = scene.arrays()
-    patches = arrays.pop("patches", None)
-    batch = {name: array[None] for name, array in arrays.items()} | {"mask": np.ones((1, len(scene.triangles)), bool)}
-    if patches is not None:
-        batch["patches"] = patches
-    model = model.to(device).eval()
-    cameras = torch.from_numpy(scene.camera_to_world[list(views)].astype(np.float32)).to(device)[None]
-    fov = torch.from_numpy(scene.fov_deg[list(views)].astype(np.float32)).to(device)[None]
-    for y in model.render_batches(model.read(batch, device), cameras, fov, resolution):
-        yield from to_radiance(y[0]).clamp(min=0).cpu().numpy()  # the network may undershoot 0 by a thousandth
+    patches = {"patches": arrays.pop("patches")} if "patches" in arrays else {}
+    cameras = ("camera_to_world", "fov_deg")
+    triangles = {name: array for name, array in arrays.items() if name not in cameras}
+    return batched(triangles) | {"mask": np.ones((1, len(scene.triangles)), bool)} | patches
 
 
-def predict_scene(
-    model: RenderFormer, scene: SceneRecord, views: Sequence[int], resolution: int, device: Any = "cpu"
-) -> np.ndarray:
+def camera_arrays(scene: SceneRecord, view: int) -> dict[str, np.ndarray]:
+    """One of its cameras, as the same batch holds it."""
+    return {name: getattr(scene, name)[None, [view]].astype(np.float32) for name in ("camera_to_world", "fov_deg")}
+
+
+def predict_scene(model: Network, scene: SceneRecord, views: Sequence[int], resolution: int, device: Any = "cpu") -> np.ndarray:
     """(V, H, W, 3) float32 linear radiance: all images of ``predict_frames`` in one array."""
     return np.stack(list(predict_frames(model, scene, views, resolution, device)))
 

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import UserError
+from stages.renderformer.hub import checkpoint as hub_checkpoint
+from stages.renderformer.hub import is_hub
 from stages.renderformer.inference.predict import light_passes, predict_frames
 from stages.renderformer.inference.room import LEAST_TRIANGLES, Room
 from stages.renderformer.inference.settings import PredictSettings
@@ -49,10 +51,13 @@ def shipped_checkpoint() -> Path:
 def checkpoint_folder(reference: Path | str | None, store: Path | str = "store") -> Path:
     """The released-format folder of a checkpoint.
 
-    ``reference``: such a folder, or a train artifact in the store. None: the model that ships. UserError: it is neither.
+    ``reference``: such a folder, ``hub:OWNER/NAME``, or a train artifact in the store. None: the model that ships. UserError:
+    it is neither.
     """
     if reference is None:
         return shipped_checkpoint()
+    if is_hub(reference):
+        return hub_checkpoint(str(reference))
     folder = Path(reference)
     if (folder / "config.json").is_file():
         return folder
@@ -78,8 +83,8 @@ def checkpoint_folder(reference: Path | str | None, store: Path | str = "store")
 class Renderer:
     """A trained network that renders scenes.
 
-    checkpoint: a released-format folder, or a train artifact (``"train"``: the newest in ``store``). None: the model that
-        ships. device: cpu, cuda or auto.
+    checkpoint: a released-format folder, ``hub:OWNER/NAME``, or a train artifact (``"train"``: the newest in ``store``). None:
+        the model that ships. device: cpu, cuda or auto.
     triangles, resolution: most triangles of a scene, and pixels per side, that the checkpoint was trained with.
     """
 
@@ -116,8 +121,8 @@ class Renderer:
     ) -> Iterator[np.ndarray]:  # fmt: skip
         """(H, W, 3) float32 linear radiance of each of the cameras ``views`` (None: all), in order, rendered when asked for.
 
-        resolution: pixels per side, or (height, width), multiples of 8 (of 64 with a Swin view stage). None: what the
-            network was trained with.
+        resolution: pixels of the longer side, or (height, width), multiples of 8 (of 64 with a Swin view stage). None: what
+            the network was trained with. All pictures are as wide as the first camera's.
         composite_lights: one pass per light, summed. Light transport is linear, so the sum is exact for a path tracer. A
             network can render more lights in this way than it was trained with.
 
@@ -135,7 +140,10 @@ class Renderer:
                 raise UserError(f"view {view} of {scene.id} does not exist: it has cameras 0 to {count - 1}")
         if composite_lights:
             check_lit(scene, scene.id)
-        size = self._size(self.resolution if resolution is None else resolution)
+        resolution = self.resolution if resolution is None else resolution
+        if isinstance(resolution, int) and len(views):
+            resolution = scene.picture_size(views[0], resolution, self.model.config.resolution_multiple)
+        size = self._size(resolution)
         for sentence in beyond_limits(scene, views, size, self.trained_with, composite_lights):
             warnings.warn(f"{scene.id}: {sentence}", LimitWarning, stacklevel=2)
         return self._frames(scene, views, size, composite_lights)
@@ -169,13 +177,14 @@ def predict(
     renderer: Renderer, path: Path | str, output: Output, settings: PredictSettings | None = None, room: Room | None = None
 ) -> list[Path]:
     """Render a scene or mesh file (``lightmill predict``); returns the files written. Notes and warnings go to stderr."""
+    from stages.renderformer.inference.scene_files import print_notes
+
     settings = settings or PredictSettings()
     scene, views = settings.apply(renderer.load(path, room))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", LimitWarning)
         images = renderer.frames(scene, views, settings.resolution, settings.composite_lights)
-    for note in scene.meta.get("notes", ()):
-        print(f"note: {note}", file=sys.stderr)
+    print_notes(scene)
     for warning in caught:
         print(f"warning: {warning.message}", file=sys.stderr)
     return output.write(images, settings.one_image)

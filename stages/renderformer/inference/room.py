@@ -16,20 +16,18 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import Reject, UserError
-from stages.graphics.geometry.measure import face_normals
 from stages.graphics.geometry.records import MeshRecord, TextureRecord
 from stages.renderformer.records import SceneRecord
 from stages.renderformer.scenes import laws, meshes
 from stages.renderformer.scenes.assemble import WALL_FACES, assemble, camera_to_world, normalize, place
-from stages.renderformer.scenes.laws import TEMPLATES, Camera, Light, Material, MaterialLaw, Placement, Plan
+from stages.renderformer.scenes.lamps import LIGHTS, three_lights
+from stages.renderformer.scenes.laws import LARGEST_TRIANGLE, TEMPLATES, Camera, Material, MaterialLaw, Placement, Plan
 
 MAX_BYTES, MAX_FACES = 1 << 28, 2_000_000  # of a mesh file, as *collect* has them
 LEAST_FACES = 128  # an object should get; a room with fewer walls is taken before
 UP = {"x": (0, 90, 0), "-x": (0, -90, 0), "y": (90, 0, 0), "-y": (-90, 0, 0), "z": (0, 0, 0), "-z": (180, 0, 0)}
 Z_UP = (".stl",)  # made for printing; the other formats mostly have y up, as glTF prescribes
 
-# Half of a quad of the largest wall, scene units squared: larger triangles are rare in the training data (paper, figure 9)
-LARGEST_TRIANGLE = (laws.WallLaw().scale[1] / 8) ** 2 / 2
 
 # Scene units. The object's bounding sphere stands on the floor in the middle.
 RADIUS = 0.4
@@ -41,9 +39,7 @@ CAMERAS = {"box": (-0.15, -1.0, 0.35)}  # direction from what they look at; of t
 CAMERA = -0.55, -1.0, 0.65
 CAMERA_DISTANCE = 1.85
 FILLED = 0.66  # of the picture's side, by the object
-LIGHTS = {(-0.9, -0.5, 1.0): 0.5, (0.55, -1.0, 0.9): 0.2, (-0.2, -0.1, 1.2): 0.3}  # direction from the centre -> share
 LEAST_TRIANGLES = WALL_FACES + len(LIGHTS) + LEAST_FACES // 2  # a floor, the lights and something on it
-LIGHT_RADIANCE, LIGHT_SCALE, LIGHT_DISTANCE = 2500.0, 2.0, 2.6
 
 
 @dataclass(frozen=True)
@@ -103,7 +99,7 @@ def room_scene(path: Path, room: Room) -> SceneRecord:
         mesh = trimesh.remesh.subdivide(*mesh)
         placement = _object(mesh[0], turn)  # another mean of the vertices
     camera = _camera(template, place(normalize(mesh[0]), placement))
-    plan = Plan(template, "single", False, [_wall(name) for name in walls], [placement], _lights(), [camera])
+    plan = Plan(template, "single", False, [_wall(name) for name in walls], [placement], three_lights(), [camera])
     meta = {"law": "room", "source": path.name, "notes": notes}
     scene = assemble(path.stem, plan, [mesh], [{"faces_before": len(original[1])}], MaterialLaw(), meta)
     if loaded.texture is None:
@@ -205,28 +201,6 @@ def _object(vertices: np.ndarray, turn: Sequence[float]) -> Placement:
     scale = RADIUS / float(np.linalg.norm(placed - (low + high) / 2, axis=1).max())
     shift = -scale * np.array([*(low + high)[:2] / 2, low[2]]) + [0, 0, _floor_height() + 1e-4]  # no two faces in one plane
     return replace(placement, scale=[scale] * 3, translation=(2 * shift).tolist())
-
-
-def _lights() -> list[Light]:
-    lights = []
-    for direction, share in LIGHTS.items():
-        away = np.array(direction) / np.linalg.norm(direction)
-        position = (LIGHT_DISTANCE * away).tolist()
-        turn = _turn_to(-away).tolist()
-        lights.append(
-            Light(away.tolist(), [0.0] * 3, LIGHT_DISTANCE, position, turn, [LIGHT_SCALE] * 3, share * LIGHT_RADIANCE)
-        )
-    return lights
-
-
-def _turn_to(direction: np.ndarray) -> np.ndarray:
-    """Degrees about x, y and z that turn the light triangle's normal to ``direction``."""
-    from scipy.spatial.transform import Rotation
-
-    normal = face_normals(meshes.LIGHT_TRIANGLE[None])[0]
-    axis = np.cross(normal, direction)
-    angle = np.arctan2(np.linalg.norm(axis), normal @ direction)
-    return Rotation.from_rotvec(axis * (angle / max(np.linalg.norm(axis), 1e-12))).as_euler("xyz", degrees=True)
 
 
 def _camera(template: str, points: np.ndarray) -> Camera:

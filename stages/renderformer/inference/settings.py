@@ -16,7 +16,7 @@ class PredictSettings:
     view: number of the scene's camera, from 0, or ``all``.
     frames: an orbit of so many images, which starts at camera ``view`` (``stages.renderformer.inference.orbit``). None: the
         view itself. arc_deg: how far the orbit goes. None: all around, or as far as walls allow.
-    resolution: pixels per side, or (height, width). None: what the network was trained with.
+    resolution: pixels of the longer side, or (height, width). None: what the network was trained with.
     composite_lights: one pass per light, summed (``Renderer.frames``).
     """
 

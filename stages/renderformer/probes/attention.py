@@ -92,6 +92,7 @@ class Attention(Probe):
     question = "Which triangles does a ray bundle look at, layer by layer?"
     setting = "ray bundle and layer"
     Config = AttentionConfig
+    inside = True
 
     def items(self, config: AttentionConfig, inputs: Inputs) -> Iterator[Item]:
         for scene_id in self.scene_ids(config, inputs):

@@ -130,6 +130,7 @@ class Probe:
     question: ClassVar[str]
     setting: ClassVar[str]  # what is varied, with its unit
     Config: ClassVar[type[ProbeConfig]] = ProbeConfig
+    inside: ClassVar[bool] = False  # whether it looks into the network's stages, and not at its pictures alone
     reads: ClassVar[tuple[str, ...]] = ("shard", "train")  # inputs
 
     def suits(self, meta: Mapping[str, Any]) -> bool:

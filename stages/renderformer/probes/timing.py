@@ -84,6 +84,7 @@ class Timing(Probe):
     question = "What do the view-independent and the view-dependent stage cost, by number of triangles?"
     setting = "triangles"
     Config = TimingConfig
+    inside = True
 
     def items(self, config: TimingConfig, inputs: Inputs) -> Iterator[Item]:
         for scene_id in self.scene_ids(config, inputs):

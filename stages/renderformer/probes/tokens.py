@@ -53,6 +53,7 @@ class Tokens(Probe):
     question = "Can a triangle's own light be read from its token, before a camera is known?"
     setting = "decoded from"
     Config = TokensConfig
+    inside = True
 
     def items(self, config: TokensConfig, inputs: Inputs) -> Iterator[Item]:
         if config.fit_split == config.split:

@@ -70,23 +70,23 @@ def filter_offsets(name: str) -> np.ndarray:
 
 
 class Cameras:
-    """Rays of a scene's cameras through points of the pixels' filter; image row 0 is on top."""
+    """Rays of a scene's cameras through points of the pixels' filter; image row 0 is on top. ``size``: (height, width)."""
 
-    def __init__(self, scene: SceneRecord, resolution: int, filter_name: str):
+    def __init__(self, scene: SceneRecord, size: tuple[int, int], filter_name: str):
         self.pose = gatherable(scene.camera_to_world[:, :3].reshape(-1, 12))
-        self.focal = gatherable(0.5 / np.tan(0.5 * np.radians(scene.fov_deg.astype(np.float64))))  # image width 1
+        self.focal = gatherable(0.5 / np.tan(0.5 * np.radians(scene.fov_deg.astype(np.float64))))  # image height 1
         self.filter = gatherable(filter_offsets(filter_name))
-        self.resolution = dr.opaque(mi.UInt32, resolution)
+        self.height, self.width = (dr.opaque(mi.UInt32, side) for side in size)
+        self.aspect = dr.opaque(mi.Float, size[1] / size[0])
 
     def ray(self, pixel: mi.UInt32, u: mi.Point2f) -> mi.Ray3f:
         """``pixel`` counts row by row through all views; ``u`` in [0, 1)^2."""
-        side = self.resolution
-        view = pixel // (side * side)
-        inside = pixel - view * side * side
-        row = inside // side
-        column = inside - row * side
-        x = (mi.Float(column) + 0.5 + self._offset(u.x)) / mi.Float(side) - 0.5
-        y = (mi.Float(row) + 0.5 + self._offset(u.y)) / mi.Float(side) - 0.5
+        view = pixel // (self.height * self.width)
+        inside = pixel - view * self.height * self.width
+        row = inside // self.width
+        column = inside - row * self.width
+        x = ((mi.Float(column) + 0.5 + self._offset(u.x)) / mi.Float(self.width) - 0.5) * self.aspect
+        y = (mi.Float(row) + 0.5 + self._offset(u.y)) / mi.Float(self.height) - 0.5
         local = dr.normalize(mi.Vector3f(x, -y, -dr.gather(mi.Float, self.focal, view)))
         entry = [dr.gather(mi.Float, self.pose, 12 * view + index) for index in range(12)]
         direction = mi.Vector3f(
@@ -262,9 +262,10 @@ class JitRenderer:
     """One scene, ready to be seen from its cameras."""
 
     def __init__(
-        self, scene: SceneRecord, resolution: int, seed: int, limits: Limits, lights_visible: bool, guided: bool = False
+        self, scene: SceneRecord, size: tuple[int, int], seed: int, limits: Limits, lights_visible: bool, guided: bool = False
     ):
-        self.record, self.resolution, self.seed = scene, resolution, seed
+        self.record, self.size, self.seed = scene, size, seed  # (height, width)
+        self.pixels = size[0] * size[1]  # of a view
         self.limits, self.lights_visible = limits, lights_visible
         surfaces = Surfaces(scene, np.arange(len(scene.triangles)))
         self.scene = mi.load_dict({"type": "scene", "surface": shape_mesh(scene, surfaces)})
@@ -272,7 +273,7 @@ class JitRenderer:
         self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
         self.guided = guided
         self.guides = [Guide(scene) if guided else Unguided() for _ in self.passes]
-        self.cameras = Cameras(scene, resolution, limits.filter)
+        self.cameras = Cameras(scene, size, limits.filter)
 
     def learn(self, views: list[int]) -> None:
         """Guide the paths of these views from now on by what those so far have brought."""
@@ -294,10 +295,9 @@ class JitRenderer:
 
         Streams share no path. A path serves all lights.
         """
-        pixels = self.resolution * self.resolution
-        ids = np.concatenate([view * pixels + np.arange(pixels) for view in views])
+        ids = np.concatenate([view * self.pixels + np.arange(self.pixels) for view in views])
         passes = [self._pass(table, number, self.cameras, ids, streams, first, spp) for number, table in enumerate(self.passes)]
-        shape = (len(streams), len(views), self.resolution, self.resolution)
+        shape = (len(streams), len(views), *self.size)
         lights = np.concatenate([p["lights"] for p in passes], axis=-2)[..., : self.record.n_lights, :]
         hit = passes[0]  # the camera rays of all passes are the same
         images = {name: values.reshape(*shape, *values.shape[2:]) for name, values in hit.items()}
@@ -320,7 +320,7 @@ class JitRenderer:
     ) -> dict[str, np.ndarray]:
         """(streams, pixels, ..) sums over the samples, float64; ``lights`` (.., lights of the pass, 3)."""
         # of resolution and samples alone, since it decides how sums are rounded
-        fitting = self.resolution**2 * spp // LANES
+        fitting = self.pixels * spp // LANES
         size = min(max(1 << fitting.bit_length() >> 1, BLOCKS[0]), BLOCKS[1])
         rows, blocks = len(streams) * len(ids), -(-spp // size)
         sums: dict[str, np.ndarray] = {}
@@ -362,7 +362,7 @@ class JitRenderer:
         def opaque(value: int) -> mi.UInt32:
             return dr.opaque(mi.UInt32, value & 0xFFFFFFFF)
 
-        places = (pixel, stream, pixel // self.resolution**2, first, count)
+        places = (pixel, stream, pixel // self.pixels, first, count)
         ids, streams, views, first, count = (gatherable(values, mi.UInt32) for values in places)
         # the first two steps are one to one in the pixel: no two pixels of a stream share their numbers
         key = mixed(mixed(mixed(ids + opaque(self.seed)) + opaque(self.seed >> 32)) + streams)

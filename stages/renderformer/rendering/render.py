@@ -97,22 +97,22 @@ def _next(samples: int) -> int:
 
 def _renderer(scene: SceneRecord, settings: RenderSettings, backend: dict[str, Any]) -> Any:
     """A ``ScalarRenderer`` or ``JitRenderer``; guided where it can be and nothing is clamped."""
-    resolution, seed, depth, lights_visible = settings.resolution, settings.seed, settings.max_depth, settings.lights_visible
+    size, seed, depth, lights_visible = settings.size, settings.seed, settings.max_depth, settings.lights_visible
     if backend["backend"] == "scalar":
         if settings.mode == "cycles":
             raise UserError("mode=cycles needs a JIT backend of Mitsuba, and none works here: " + backends.INSTALL)
         from stages.renderformer.rendering.scalar import ScalarRenderer
 
-        return ScalarRenderer(scene, resolution, seed, depth, lights_visible)
+        return ScalarRenderer(scene, size, seed, depth, lights_visible)
     from stages.renderformer.rendering.jit import JitRenderer, Limits
 
     if settings.mode == "physical":
         guided = settings.target_error > 0 and settings.max_spp > FIRST_SPP  # else there is no second portion to guide
-        return JitRenderer(scene, resolution, seed, Limits(depth - 1), lights_visible, guided)
+        return JitRenderer(scene, size, seed, Limits(depth - 1), lights_visible, guided)
     # Cycles lets light in at the hit behind the last counted bounce, hence 12 + 1.
     bounces = min(depth - 1, 13)
     limits = Limits(bounces, 4, 4, 10.0, "blackman-harris", glossy_filter=True, multiscatter=True)
-    return JitRenderer(scene, resolution, seed, limits, lights_visible)
+    return JitRenderer(scene, size, seed, limits, lights_visible)
 
 
 def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error: float | None, dropped: int) -> ViewRecord:

@@ -26,8 +26,8 @@ class ScalarRenderer:
 
     guided = False  # Mitsuba's own integrator picks directions by itself
 
-    def __init__(self, scene: SceneRecord, resolution: int, seed: int, max_depth: int, lights_visible: bool):
-        self.record, self.resolution, self.seed, self.max_depth = scene, resolution, seed, max_depth
+    def __init__(self, scene: SceneRecord, size: tuple[int, int], seed: int, max_depth: int, lights_visible: bool):
+        self.record, self.size, self.seed, self.max_depth = scene, size, seed, max_depth  # (height, width)
         self.lights_visible = lights_visible
         surfaces = np.nonzero(scene.light_index < 0)[0]
         shapes = {"surface": surface_mesh(scene, surfaces)} if len(surfaces) else {}
@@ -60,12 +60,12 @@ class ScalarRenderer:
         return [self._sample(views, stream, first, spp) for stream in streams]
 
     def _sample(self, views: list[int], stream: int, first: int, spp: int) -> list[Sums]:
-        count, resolution = self.record.n_lights, self.resolution
+        count = self.record.n_lights
         share = self.light_spp(spp)
-        shape = (resolution, resolution, 3)
+        shape = (*self.size, 3)
         lights = np.zeros((len(views), count, *shape))
         direct = np.zeros((len(views), *shape))
-        sensors = [perspective(self.record, view, resolution) for view in views]
+        sensors = [perspective(self.record, view, self.size) for view in views]
 
         def trace(sensor, depth: int, samples: int, *where: int) -> np.ndarray:
             integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": not self.lights_visible})
@@ -138,26 +138,29 @@ class ScalarRenderer:
 
     def _directions(self, view: int) -> np.ndarray:
         """(H, W, 3) unnormalised directions of the rays through the pixel centres, world space."""
-        centre = (np.arange(self.resolution) + 0.5) / self.resolution - 0.5
+        height, width = self.size
+        right = ((np.arange(width) + 0.5) / width - 0.5) * (width / height)
+        down = (np.arange(height) + 0.5) / height - 0.5
         focal = 0.5 / np.tan(0.5 * np.radians(float(self.record.fov_deg[view])))
-        x, y = np.meshgrid(centre, -centre)
+        x, y = np.meshgrid(right, -down)
         return np.stack([x, y, np.full_like(x, -focal)], axis=-1) @ self.record.camera_to_world[view, :3, :3].T
 
 
-def perspective(scene: SceneRecord, view: int, resolution: int) -> mi.Sensor:
-    """The scene's camera as a sensor of Mitsuba's, with a box filter."""
+def perspective(scene: SceneRecord, view: int, size: tuple[int, int]) -> mi.Sensor:
+    """The scene's camera as a sensor of Mitsuba's, with a box filter. ``size``: (height, width) in pixels."""
     turn = np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba looks along +z with +x to the left
     return mi.load_dict(
         {
             "type": "perspective",
             "fov": float(scene.fov_deg[view]),
+            "fov_axis": "y",
             "near_clip": 1e-4,
             "far_clip": 1e4,
             "to_world": mi.ScalarTransform4f(scene.camera_to_world[view].astype(np.float64) @ turn),
             "film": {
                 "type": "hdrfilm",
-                "width": resolution,
-                "height": resolution,
+                "width": size[1],
+                "height": size[0],
                 "rfilter": {"type": "box"},
                 "pixel_format": "rgba",
                 "component_format": "float32",

@@ -13,7 +13,7 @@ MODES = ("physical", "cycles")
 class RenderSettings:
     """One object for the render stage, the probes, ``lightmill trace`` and ``lightmill compare``.
 
-    resolution: pixels per side. seed: of all random numbers.
+    resolution: pixels per side, or (height, width). seed: of all random numbers.
     max_spp: camera paths per pixel for the image with all lights on, at most. The JIT integrator shares each path among all
         lights; the scalar one gives each light its share of the paths.
     target_error: bound on the estimated error of a view (``stages.renderformer.rendering.error``). A view gets 16 samples, then
@@ -25,7 +25,7 @@ class RenderSettings:
     lights_visible: whether camera rays see lights; reflections always do.
     """
 
-    resolution: int
+    resolution: int | tuple[int, int]
     max_spp: int
     seed: int = 0
     target_error: float = 0.0
@@ -37,6 +37,11 @@ class RenderSettings:
     def __post_init__(self) -> None:
         if self.mode not in MODES:
             raise UserError(f"mode={self.mode!r} is unknown: choose from {', '.join(MODES)}")
-        for name, least in (("resolution", 1), ("max_spp", 1), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise UserError(f"{name}={getattr(self, name)}: expected at least {least}")
+        for name, value, least in (("resolution", min(self.size), 1), ("max_spp", self.max_spp, 1), ("seed", self.seed, 0)):
+            if value < least:
+                raise UserError(f"{name}={value}: expected at least {least}")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the picture in pixels; a camera's field of view is across the height."""
+        return (self.resolution, self.resolution) if isinstance(self.resolution, int) else self.resolution

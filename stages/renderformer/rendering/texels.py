@@ -52,7 +52,7 @@ def texel_radiance(
     cross = normal_vectors(corners)
     normals = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
     points = (weights @ corners).reshape(-1, 3)
-    renderer = JitRenderer(scene, 1, seed, Limits(33), lights_visible=True)
+    renderer = JitRenderer(scene, (1, 1), seed, Limits(33), lights_visible=True)
     sums = renderer.texel_sums(points, np.repeat(normals, len(weights), axis=0), HEIGHT, spp)
     met = (sums["triangle"].reshape(len(faces), -1) == faces[:, None]) & (scene.light_index[faces] < 0)[:, None]
     arriving = sums["lights"].reshape(len(faces), len(weights), -1, 3) / spp * met[..., None, None]

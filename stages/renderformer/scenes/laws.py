@@ -87,6 +87,10 @@ class WallLaw(Section):
     offset_along: Range = (-0.25, 0.25)  # wall template: along y; corner: along each wall's own normal
 
 
+# Half of a quad of the largest wall, scene units squared: larger triangles are rare in the training data (paper, figure 9)
+LARGEST_TRIANGLE = (WallLaw().scale[1] / 8) ** 2 / 2
+
+
 class ObjectLaw(Section):
     """Objects have their vertex mean at the origin and a largest radius of 0.5 before scale, in template units."""
 

@@ -13,15 +13,13 @@ reading: the last two axes are row and column as ``SceneRecord.patches`` says.
 from __future__ import annotations
 
 import json
-import re
-import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.errors import Reject, UserError
-from stages.graphics.geometry.measure import face_normals
+from stages.graphics.geometry.measure import face_normals, have_area
 from stages.renderformer.records import PATCH_CHANNELS, PATCH_KEPT, PATCH_SIDE, TEXTURED_CHANNELS, SceneRecord, patch_means
 from stages.renderformer.scenes.assemble import rotation_matrix
 
@@ -80,7 +78,7 @@ def load_json(path: Path) -> SceneRecord:
             "object_index",
         )
     }
-    objects, lights = [], 0
+    objects, notes, lights = [], [], 0
     for index, (name, entry) in enumerate(data["objects"].items()):
         where = f"{path}: object {name!r}"
         if not isinstance(entry, dict):
@@ -92,6 +90,9 @@ def load_json(path: Path) -> SceneRecord:
         count = len(triangles)
         emission = _numbers(material, "emissive", (0, 0, 0), where, low=0)
         emits = bool(emission.max() > 0)
+        if emits and not have_area(triangles.astype(np.float32)).any():
+            notes.append(f"{name}: a light without area adds nothing")
+            emission, emits = np.zeros(3), False
         values = {
             "triangles": triangles,
             "vertex_normals": normals,
@@ -107,12 +108,15 @@ def load_json(path: Path) -> SceneRecord:
         lights += emits
         objects.append({"name": str(name), "kind": "light" if emits else "object", "faces": count})
     poses, fovs = zip(*[_camera(camera, f"{path}: camera {index}") for index, camera in enumerate(cameras)], strict=True)
+    aspects = [_aspect(camera, f"{path}: camera {index}") for index, camera in enumerate(cameras)]
     arrays = {name: np.concatenate(parts).astype(SceneRecord.DTYPES[name]) for name, parts in columns.items()}
     meta = {
         "template": "released",
         "law": "released",
         "scene_name": str(data.get("scene_name", path.stem)),
         "objects": objects,
+        **({"notes": notes} if notes else {}),
+        **({} if aspects == [1.0] * len(aspects) else {"aspect": aspects}),
     }
     return SceneRecord(
         path.stem, **arrays, camera_to_world=np.stack(poses).astype(np.float32), fov_deg=np.float32(fovs), meta=meta
@@ -138,29 +142,13 @@ def _mesh(folder: Path, entry: dict[str, Any], smooth: bool, where: str) -> tupl
     """Transformed triangles (F, 3, 3), unit corner normals (F, 3, 3), and the shading group (F,) of each triangle."""
     import trimesh
 
-    from stages.graphics.geometry.load import SUFFIXES, check_claims
-
     name = entry.get("mesh_path")
     if not isinstance(name, str) or not name:
         raise UserError(f"{where} has no mesh_path")
     path = (folder / name).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise UserError(f"{where}: mesh_path {name!r} leads out of the scene's folder; put the mesh beside the scene file")
-    if not path.is_file():
-        raise UserError(f"{where}: mesh file {path} does not exist")
-    if path.suffix.lower() not in SUFFIXES:
-        raise UserError(f"{where}: mesh file {path} is of no kind that is read: expected {', '.join(SUFFIXES)}")
-    try:
-        check_claims(path, MAX_MESH_BYTES, MAX_MESH_FACES)
-        mesh = trimesh.load(path, process=False, force="mesh")  # its resolver opens nothing outside the mesh's folder
-    except Exception as error:  # trimesh's loaders raise whatever they meet
-        raise UserError(f"{where}: {path} cannot be read as a mesh ({error})") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise UserError(f"{where}: {path} has no faces")
-    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
-    if not np.isfinite(vertices).all():
-        bad = int(np.nonzero(~np.isfinite(vertices).all(axis=1))[0][0])
-        raise UserError(f"{where}: vertex {bad} of {path} is not finite")
+    vertices, faces = _arrays(path, where)
 
     transform = entry.get("transform") or {}
     if transform.get("normalize"):
@@ -185,41 +173,31 @@ def _mesh(folder: Path, entry: dict[str, Any], smooth: bool, where: str) -> tupl
     return triangles, np.where(length > 0.5, normals / np.maximum(length, 1e-12), flat), groups
 
 
-def files_beside(mesh: Path) -> list[Path]:
-    """The files that trimesh opens besides a mesh file: buffers and images of a glTF, the material library of an OBJ and
-    its images, the image of a PLY. Sorted; [] where the mesh cannot be read."""
-    from stages.graphics.geometry.load import split_glb
+def _arrays(path: Path, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """(V, 3) float64 vertices and (F, 3) faces of a mesh file, as they are."""
+    from stages.graphics.geometry.formats.parts import Source
+    from stages.graphics.geometry.load import PLAIN, read_parts
 
-    folder, kind, side_files = mesh.parent.resolve(), mesh.suffix.lower(), set()
-
-    def add(name: str) -> list[Path]:
-        """The files that a name can mean: trimesh tries it as written, then relative, then its last part."""
-        tries = (name.strip(), name.strip().lstrip("/"), name.strip().rpartition("/")[2])
-        files = {(folder / attempt).resolve() for attempt in tries if "\0" not in attempt}
-        files = {file for file in files if file.is_relative_to(folder) and file.is_file()}
-        side_files.update(files)
-        return sorted(files)
-
-    def text(pattern: bytes, data: bytes) -> list[str]:
-        return [match.decode("utf-8", "replace") for match in re.findall(pattern, data, flags=re.MULTILINE | re.IGNORECASE)]
-
+    if not path.is_file():
+        raise UserError(f"{where}: mesh file {path} does not exist")
+    if path.suffix.lower() not in PLAIN:
+        raise UserError(f"{where}: mesh file {path} is of no kind that is read: expected {', '.join(PLAIN)}")
     try:
-        data = mesh.read_bytes()
-        if kind in (".gltf", ".glb"):
-            tree = split_glb(data)[0] if kind == ".glb" else json.loads(data)
-            for entry in (*tree.get("buffers", ()), *tree.get("images", ())):
-                if "base64," not in entry.get("uri", "base64,"):
-                    add(entry["uri"])
-        elif kind == ".obj":
-            for library in [file for name in text(rb"mtllib(.*)$", data) for file in add(name)]:
-                for name in text(rb"map_kd(.*)$", library.read_bytes()):
-                    add(name)
-        elif kind == ".ply":
-            for name in text(rb"TextureFile(.*)$", data[: data.find(b"end_header")]):
-                add(name)
-    except (Reject, OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, struct.error):
-        pass  # the scene is rejected when it is read
-    return sorted(side_files)
+        parts = read_parts(Source(path, path.parent, MAX_MESH_BYTES, MAX_MESH_FACES))
+    except Reject as reject:
+        raise UserError(f"{where}: {path} cannot be read as a mesh ({reject})") from None
+    if not parts:
+        raise UserError(f"{where}: {path} has no faces")
+    starts = np.cumsum([0, *(len(part.points) for part in parts[:-1])])
+    faces = np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=True)])
+    return np.concatenate([part.points for part in parts]), faces
+
+
+def files_beside(mesh: Path) -> list[Path]:
+    """The files that are opened besides a mesh file: the buffers of a glTF. Materials are the scene's, not the mesh's."""
+    from stages.graphics.geometry.side_files import buffers
+
+    return buffers(mesh, mesh.parent)
 
 
 def _scale(transform: dict[str, Any], where: str) -> np.ndarray:
@@ -265,6 +243,14 @@ def _camera(camera: Any, where: str) -> tuple[np.ndarray, float]:
     return pose, fov
 
 
+def _aspect(camera: dict[str, Any], where: str) -> float:
+    """Width over height of the picture: an entry of ours, which other readers pass over."""
+    aspect = _numbers(camera, "aspect", 1.0, where)
+    if not 0.01 <= aspect <= 100:
+        raise UserError(f"{where}: aspect is {aspect}, expected width over height")
+    return aspect
+
+
 # --- HDF5 -------------------------------------------------------------------------------------------------------------
 
 
@@ -280,6 +266,7 @@ def load_hdf5(path: Path) -> SceneRecord:
                 raise UserError(f"{path} has no dataset {', '.join(missing)}: expected {', '.join(shapes)}")
             arrays = {name: _dataset(file, name, path).astype(np.float32) for name in shapes if name != "texture"}
             texture = _dataset(file, "texture", path)
+            aspects = np.atleast_1d(np.asarray(file["fov"].attrs.get("aspect", []), np.float64))
     except (OSError, RuntimeError, KeyError) as error:
         raise UserError(f"{path} is not an HDF5 file that can be read ({error})") from error
     patch_index, patches = None, None
@@ -298,6 +285,13 @@ def load_hdf5(path: Path) -> SceneRecord:
     channel = {name: arrays["texture"][:, part] for name, part in PATCH_CHANNELS.items()}
     triangles = arrays["triangles"]
     light_index = _light_groups(triangles, channel["emission"].max(axis=1) > 0)
+    notes, emission = [], channel["emission"]
+    wide = np.bincount(light_index[light_index >= 0], have_area(triangles)[light_index >= 0]) > 0  # lights with an area
+    if not wide.all():
+        notes = [f"{int((~wide).sum())} of {len(wide)} lights: a light without area adds nothing"]
+        lit = (light_index >= 0) & wide[light_index] if wide.any() else np.zeros(len(triangles), bool)
+        emission = np.where(lit[:, None], emission, 0)
+        light_index = _light_groups(triangles, lit)
     lights = int(light_index.max(initial=-1)) + 1
     objects = [{"name": "surface", "kind": "object", "faces": int((light_index < 0).sum())}]
     objects += [
@@ -310,12 +304,19 @@ def load_hdf5(path: Path) -> SceneRecord:
         channel["diffuse"],
         channel["specular"],
         np.maximum(channel["roughness"][:, 0], MIN_ROUGHNESS),
-        channel["emission"],
+        emission,
         light_index,
         (light_index + 1).astype(np.int16),
         arrays["c2w"],
         arrays["fov"],
-        {"template": "released", "law": "released", "scene_name": path.stem, "objects": objects},
+        {
+            "template": "released",
+            "law": "released",
+            "scene_name": path.stem,
+            "objects": objects,
+            **({"notes": notes} if notes else {}),
+            **({"aspect": aspects.tolist()} if len(aspects) == len(arrays["fov"]) and (aspects > 0.01).all() else {}),
+        },
         patch_index,
         patches,
     )

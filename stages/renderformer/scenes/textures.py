@@ -120,6 +120,7 @@ def nearest_colours(
     vertices = np.ascontiguousarray(vertices, np.float64)
     faces = np.ascontiguousarray(faces[visible], np.int64)
     material, uv = texture.material[visible].astype(np.int64), texture.uv[visible].astype(np.float64)
+    tint = None if texture.tint is None else texture.tint[visible]
     corners = vertices[faces]
     tree = igl.AABB()
     tree.init(vertices, faces)
@@ -127,7 +128,7 @@ def nearest_colours(
     def colours(points: np.ndarray) -> np.ndarray:
         _, face, nearest = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
         face = np.asarray(face).ravel()
-        place = _barycentric(nearest, corners[face])
+        place = barycentric(nearest, corners[face])
         where = np.einsum("nk,nkc->nc", place, uv[face])
         look = material[face]
         out = texture.colour[look].astype(np.float32)
@@ -135,6 +136,8 @@ def nearest_colours(
             of_look = look == row
             if of_look.any():
                 out[of_look] *= look_up(texture.images[texture.image[row]], where[of_look], tuple(texture.wrap[row]))
+        if tint is not None:
+            out *= np.einsum("nk,nkc->nc", place, tint[face]).astype(np.float32)
         return out
 
     return colours
@@ -195,7 +198,7 @@ def _means(colours, faces: int, shape: tuple[int, ...]) -> np.ndarray:
     return full_patches(inside)
 
 
-def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """(N, 3) weights of points that lie in (N, 3, 3) triangles; even where a triangle has no area."""
     a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
     aa, ab, bb = (np.einsum("ij,ij->i", x, y) for x, y in ((a, a), (a, b), (b, b)))

@@ -54,5 +54,5 @@ def test_the_stand_in_sees_edges_and_no_constant():
 
 
 def test_missing_weights_say_what_to_do(tmp_path):
-    with pytest.raises(ValueError, match="vgg16-397923af.pth.*lightmill weights lpips.*perceptual_network=gradients"):
+    with pytest.raises(ValueError, match="vgg16.safetensors.*lightmill weights lpips.*perceptual_network=gradients"):
         perceptual_loss("vgg", tmp_path, CPU)

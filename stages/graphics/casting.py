@@ -1,6 +1,6 @@
-"""Rays against a mesh with embree, on one thread; the first hit alone.
+"""Rays against a mesh with embree, on one thread: first hits, and whether a segment is free.
 
-A pixel's ray goes through its centre, so this equals rasterization but for ties on edges (0.01 % of pixels).
+A pixel's ray goes through its centre, so a `Caster.view` equals rasterization but for ties on edges (0.01 % of pixels).
 """
 
 from __future__ import annotations
@@ -78,6 +78,17 @@ class Caster:
             np.where(hit[:, None], barycentric, 0).astype(np.float32),
             np.where(hit, distance, 0).astype(np.float32),
         )
+
+    def occluded(self, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+        """(N,) bool: whether anything lies on the segments from ``origins`` (N, 3) along unit ``directions`` (N, 3).
+
+        lengths: (N,), in world units.
+        """
+        if not len(self.faces) or not len(directions):
+            return np.zeros(len(directions), bool)
+        starts = (np.asarray(origins, float) - self.origin).astype(np.float32)
+        rays, lengths = (np.ascontiguousarray(values, np.float32) for values in (directions, lengths))
+        return np.asarray(self._scene.run(starts, rays, dists=lengths, query="OCCLUDED")) >= 0
 
     def view(self, camera: Camera, rays_per_side: int = 1) -> GBuffer:
         """What the camera sees; with ``rays_per_side`` n, on a grid n times as fine in both directions."""

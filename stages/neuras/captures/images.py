@@ -1,0 +1,145 @@
+"""Captures that are images and nothing else: a folder of photos, or a video, registered by pycolmap.
+
+``prepare`` cuts the video and makes a model of COLMAP of the images, in a process of its own. Seeds are fixed and the mapper
+has one thread, so a second run finds the same poses, in eight runs of nine to the last digit. A photo that could not be placed
+is rejected.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pipeline.atomic import atomic_path
+from pipeline.errors import Reject, UserError
+from stages.graphics.geometry.paths import inside
+from stages.graphics.video import frame_count, read_video
+from stages.neuras.captures import colmap, registration
+from stages.neuras.captures.sources import FEWEST, Inventory, PointSet, Shot, file_in, shot_of
+
+PHOTOS = (".jpg", ".jpeg", ".png")
+VIDEOS = (".mp4", ".mov", ".m4v")
+CUT, MODEL, JOB = "images", "sparse/0", "job.json"  # below the prepared folder
+QUALITY = 95  # of the JPEGs that a video is cut into
+
+
+def root_of(path: str | None) -> Path:
+    """The folder of photos, or the video, that ``capture.path`` names."""
+    root = Path(path).expanduser() if path else None
+    if root is None or not (root.is_dir() or (root.is_file() and root.suffix.lower() in VIDEOS)):
+        raise UserError(f"capture.path={path!r}: capture=images needs a folder of photos or a video ({', '.join(VIDEOS)})")
+    return root
+
+
+def read(config: Any, root: Path, prepared: Path | None = None) -> Inventory:
+    """The inventory of the images, with their poses if ``prepared`` is the folder that ``prepare`` wrote to."""
+    names = _names(config, root)
+    where = prepared if root.is_file() else root
+    folder = None if prepared is None else prepared / MODEL
+    placed = {} if folder is None else {image.name: image for image in colmap.images(folder)}
+    lenses = {} if folder is None else colmap.cameras(folder)
+
+    def fill(shot: Shot) -> None:
+        if where is not None:
+            shot.image = file_in(where, shot.name, "image")
+        if folder is not None:
+            if shot.name not in placed:
+                raise Reject("no_pose", "pycolmap could not place it among the others: blurred, or without overlap")
+            image = placed[shot.name]
+            shot.lens, shot.camera_to_world = lenses[image.camera], colmap.camera_to_world(image)
+
+    shots = [shot_of(name, fill) for name in names]
+    for shot in shots:
+        shot.moment = shot.name
+    points = PointSet("sfm", None, lambda: (colmap.points(folder, config.max_bytes)[1], None))
+    files = [root] if root.is_file() else [root / name for name in names]
+    return Inventory(shots, [points], "sfm", units_from="images alone have no unit", decided_by=files)
+
+
+def prepare(config: Any, root: Path, folder: Path) -> None:
+    """Write the model of COLMAP, and a video's frames, below ``folder``; what is there already stays."""
+    if (folder / MODEL / "points3D.bin").is_file():
+        return
+    if not can_register():
+        raise UserError(
+            "capture=images needs pycolmap: pip install 'lightmill[images]'; "
+            "or register the images with any program that writes a model of COLMAP, and use capture=colmap"
+        )
+    names = _names(config, root)
+    if root.is_file():
+        _cut(root, folder, names)
+    images = folder if root.is_file() else root
+    sizes = {Image.open(images / name).size for name in names}
+    job = {
+        "images": str(images.resolve()),
+        "names": names,
+        "one_camera": len(sizes) == 1,
+        "sequential": root.is_file(),
+        "side": config.sfm_side,
+        "folder": str(folder.resolve()),
+    }
+    (folder / JOB).write_text(json.dumps(job))
+    command = [sys.executable, "-P", registration.__file__, str(folder / JOB)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        last = (done.stderr.strip() or "no word").splitlines()[-1][:200]
+        raise UserError(f"pycolmap ended with status {done.returncode}: {last}; capture=colmap takes a model made elsewhere")
+    placed = len(colmap.images(folder / MODEL)) if (folder / MODEL / "images.bin").is_file() else 0
+    if placed < max(FEWEST, len(names) // 4):
+        raise UserError(
+            f"pycolmap could place {placed} of {len(names)} images: take more of them, sharp, from positions that differ, "
+            "each place in at least three; bare walls, water and moving crowds give nothing to hold on to"
+        )
+
+
+def can_register() -> bool:
+    return importlib.util.find_spec("pycolmap") is not None
+
+
+def _names(config: Any, root: Path) -> list[str]:
+    """The images' names, relative to the folder; of a video, those that its frames will have."""
+    if root.is_file():
+        return [f"{CUT}/frame_{number:04d}.jpg" for number in range(min(config.video_frames, frame_count(root)))]
+    found = sorted(path for path in root.rglob("*") if path.suffix.lower() in PHOTOS and path.is_file())
+    names = [path.relative_to(root).as_posix() for path in found if inside(path, root)]
+    if len(names) < FEWEST:
+        raise UserError(
+            f"capture.path={str(root)!r} holds {len(names)} photos ({', '.join(PHOTOS)}), at least {FEWEST} are needed"
+        )
+    return names
+
+
+def _cut(video: Path, folder: Path, names: list[str]) -> None:
+    """Of as many equal stretches of the video as there are names, the sharpest frame."""
+    (folder / CUT).mkdir(exist_ok=True)
+    total = frame_count(video)
+    best: tuple[float, np.ndarray] | None = None
+    index = 0
+    for number, frame in enumerate(read_video(video)):
+        stretch = min(number * len(names) // total, len(names) - 1)
+        if stretch != index:
+            _save(best, folder / names[index])
+            best, index = None, stretch
+        sharpness = _sharpness(frame)
+        if best is None or sharpness > best[0]:
+            best = sharpness, frame
+    _save(best, folder / names[index])
+
+
+def _save(best: tuple[float, np.ndarray] | None, path: Path) -> None:
+    if best is not None:
+        with atomic_path(path) as temporary:
+            Image.fromarray(best[1]).save(temporary, "JPEG", quality=QUALITY, subsampling=0)
+
+
+def _sharpness(frame: np.ndarray) -> float:
+    """The mean square of differences between neighbours: the least blurred of like frames has most."""
+    green = frame[::2, ::2, 1].astype(np.float32)
+    return float(np.square(np.diff(green, axis=0)).mean() + np.square(np.diff(green, axis=1)).mean())

@@ -1,0 +1,141 @@
+"""Captures of images alone: photos or a video in, poses and points by pycolmap."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from pipeline.config import parse
+from pipeline.errors import UserError
+from pipeline.run import run_pipeline
+from pipeline.store.files import hash_file
+from stages.graphics.video import frame_count, write_video
+from stages.neuras.captures import images
+from stages.neuras.records import CaptureInfo, frames, point_sets
+from stages.neuras.s00_capture import Capture
+from tests.neuras.test_captures import POINT, colmap_model, dot_of, real
+
+
+def run(path: Path, store: Path, **settings):
+    capture = {"name": "images", "path": str(path), **settings}
+    root = {"system": "neuras", "stage": "capture", "store": str(store), "workers": 0, "capture": capture}
+    return run_pipeline(root, [], out=lambda line: None)["artifacts"]["capture"]
+
+
+@pytest.fixture
+def registered(tmp_path, monkeypatch):
+    """A stand-in for pycolmap: it places the six photos of ``colmap_model``, all but the last."""
+    made = colmap_model(tmp_path / "made", True)
+    jobs = []
+
+    def program(command, **_):
+        job = json.loads(Path(command[-1]).read_text())
+        jobs.append(job)
+        shutil.copytree(made / "sparse", Path(job["folder"]) / "sparse", dirs_exist_ok=True)
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(images.subprocess, "run", program)
+    monkeypatch.setattr(images, "can_register", lambda: True)
+    return made / "images", jobs
+
+
+def test_photos_get_their_poses_and_one_that_cannot_be_placed_is_rejected(tmp_path, registered):
+    photos, jobs = registered
+    Image.open(photos / "00.png").rotate(180).save(photos / "lost.png")
+    artifact = run(photos, tmp_path / "store")
+    found = list(frames(artifact))
+    assert len(found) == 6 and artifact.manifest["outputs"]["rejects"] == {"no_pose": 1}
+    for frame in found:
+        assert np.abs(dot_of(frame) - frame.camera.project(POINT)[0]).max() < 0.12
+    assert [record.points.shape for record in point_sets(artifact)] == [(1, 3)]
+    assert CaptureInfo.of(artifact).units == "arbitrary" and CaptureInfo.of(artifact).points == "sfm"
+    assert jobs[0]["one_camera"] and not jobs[0]["sequential"] and len(jobs[0]["names"]) == 7
+
+
+def test_every_photo_is_part_of_every_key(tmp_path, registered):
+    photos, _ = registered
+    stage = Capture()
+
+    def items():
+        return stage.identity(parse(stage.Config, {"name": "images", "path": str(photos)}, "capture"), hash_file)["items"]
+
+    before = items()
+    Image.open(photos / "03.png").rotate(180).save(photos / "03.png")
+    assert len(before) == 7 and all(before[id] != value for id, value in items().items())  # all poses may be others
+
+
+def test_a_change_of_the_unit_registers_once_and_takes_the_frames_over(tmp_path, registered):
+    photos, _ = registered
+    first, second = run(photos, tmp_path / "store"), run(photos, tmp_path / "store", units="metre")
+    assert first.key != second.key and CaptureInfo.of(second).metre == 1
+    assert [first.digest_of(row.id) for row in first.rows()] == [second.digest_of(row.id) for row in second.rows()]
+
+
+def test_a_video_is_cut_into_the_sharpest_frame_of_each_stretch(tmp_path):
+    noise = np.random.default_rng(0).uniform(0, 255, (64, 96, 3))
+    sharp = {2, 9, 11, 17}  # of four stretches of five
+
+    def pictures():
+        for number in range(20):
+            picture = gaussian_filter(noise, (0.6, 0.6, 0) if number in sharp else (4, 4, 0))
+            picture[:, :24] = 12 * number  # says which it is
+            yield picture.astype(np.uint8)
+
+    video = tmp_path / "drive.mp4"
+    write_video(video, pictures())
+    assert frame_count(video) == 20
+    names = images._names(parse(Capture.Config, {"name": "images", "path": str(video), "video_frames": 4}, "capture"), video)
+    images._cut(video, tmp_path, names)
+    left = [np.array(Image.open(tmp_path / name))[:, 4:20].mean() / 12 for name in names]
+    assert np.round(left).astype(int).tolist() == sorted(sharp)
+
+
+def test_what_holds_no_images_is_told(tmp_path):
+    with pytest.raises(UserError, match="a folder of photos or a video"):
+        run(tmp_path / "none", tmp_path / "store")
+    Image.new("RGB", (8, 8)).save(tmp_path / "one.png")
+    with pytest.raises(UserError, match="holds 1 photos.*at least 3"):
+        run(tmp_path, tmp_path / "store")
+    (tmp_path / "film.mp4").write_bytes(b"no film")
+    with pytest.raises(UserError, match="no video that can be read"):
+        run(tmp_path / "film.mp4", tmp_path / "store")
+
+
+def test_without_pycolmap_it_says_what_to_install(tmp_path, monkeypatch):
+    for number in range(3):
+        Image.new("RGB", (8, 8)).save(tmp_path / f"{number}.png")
+    monkeypatch.setattr(images, "can_register", lambda: False)
+    with pytest.raises(UserError, match=r"pip install 'lightmill\[images\]'.*capture=colmap"):
+        run(tmp_path, tmp_path / "store")
+
+
+needs_pycolmap = pytest.mark.skipif(not images.can_register(), reason="pycolmap is not installed: the extra 'images'")
+
+
+@needs_pycolmap
+def test_pycolmap_places_real_photos_as_it_did_before(tmp_path, shared_data):
+    source = real(shared_data, "caliterra-colmap") / "images"
+    (tmp_path / "photos").mkdir()
+    for path in sorted(source.iterdir())[4:12]:
+        image = Image.open(path)
+        image.resize((450, round(450 * image.height / image.width))).save(tmp_path / "photos" / path.name, quality=92)
+    once, again = (run(tmp_path / "photos", tmp_path / f"store{number}") for number in range(2))
+    assert len(list(frames(once))) == 8 and len(next(point_sets(once)).points) > 300
+    apart = [a.camera.camera_to_world - b.camera.camera_to_world for a, b in zip(frames(once), frames(again), strict=True)]
+    assert np.abs(apart).max() < 0.01 * CaptureInfo.of(once).radius
+
+
+@needs_pycolmap
+def test_images_that_show_nothing_alike_are_told(tmp_path):
+    for number in range(4):
+        noise = gaussian_filter(np.random.default_rng(number).uniform(0, 255, (120, 160, 3)), (1, 1, 0))
+        Image.fromarray(noise.astype(np.uint8)).save(tmp_path / f"{number}.png")
+    with pytest.raises(UserError, match="could place 0 of 4 images.*overlap|take more of them"):
+        run(tmp_path, tmp_path / "store")
