@@ -13,8 +13,8 @@ from PIL import Image
 from pydantic import ValidationError
 
 from model.neuras.baked import Baked
+from model.neuras.losses import vgg_file
 from model.neuras.sampling import Pyramid
-from model.weights import VGG16
 from pipeline.errors import UserError
 from pipeline.plan import plan_stage
 from pipeline.store.draft import Draft
@@ -195,9 +195,10 @@ def test_vgg_enters_the_fit_and_its_key_by_content(tmp_path, inputs, weights, mo
 
     other = tmp_path / "other"
     other.mkdir()
-    (other / VGG16.name).write_bytes((weights / VGG16.name).read_bytes())
+    file_of_vgg = vgg_file(weights)
+    (other / file_of_vgg.name).write_bytes(file_of_vgg.read_bytes())
     assert key(with_vgg(other)) == key(config) != key(without)
-    with (other / VGG16.name).open("ab") as file:
+    with (other / file_of_vgg.name).open("ab") as file:
         file.write(b"0")
     assert key(with_vgg(other)) != key(config)
     with pytest.raises(ValueError, match="lightmill weights lpips"):

@@ -45,7 +45,7 @@ def test_the_default_street_is_large_and_varied():
     assert len(faces) >= 200_000 and city.houses >= 40
     walls = {group.name for group in city.groups if group.name.startswith("wall")}
     assert len(walls) >= 12 and len(city.groups) >= 60
-    assert {group.kind for group in city.groups} == {"matt", "gloss", "metal"}
+    assert {group.kind for group in city.groups} == {"matt", "satin", "gloss", "metal"}
 
 
 @pytest.mark.parametrize("preset", ["street", "drone"])

@@ -51,7 +51,7 @@ def test_packed_rows_follow_sparse_adam():
     for step in range(1, 8):
         rows = torch.randperm(40, generator=generator)[:9].sort().values
         gradient = torch.randn(9, 3, generator=generator)
-        table.update(rows, gradient, 0.02, step)
+        table.update(rows, gradient, torch.full((3,), 0.02), step)
         weight.weight.grad = torch.sparse_coo_tensor(rows[None], gradient, (40, 3))
         adam.step()
     assert torch.allclose(table.values, weight.weight, atol=1e-6)
@@ -116,7 +116,9 @@ def test_networks_start_as_colours_and_opacities(layers):
     features[:, :3], features[:, 3] = torch.rand(30, 3), torch.linspace(-3, 3, 30)
     colours, opacities = shading.SkyShader(config)(features, directions)
     assert (opacities - torch.sigmoid(features[:, 3])).abs().max() < 1e-5
-    for found in (colours, shading.MeshShader(config)(features, directions)):
+    on_mesh = features.clone()
+    on_mesh[:, 3] = 0  # a mesh has no opacity: its texels start without
+    for found in (colours, shading.MeshShader(config)(on_mesh, directions)):
         assert (found - features[:, :3]).abs().max() < 0.15
 
 
@@ -175,7 +177,7 @@ def test_texels_take_no_value_from_those_that_do_not_lend():
 
 def test_a_coarse_level_moves_the_neighbours():
     maps = Maps(np.full(3, True), np.full(3, True), [np.array([0, 0, 1])], [], torch.zeros(3, 2))
-    maps.update(torch.tensor([0]), torch.ones(1, 2), lr=0.1, step=1)
+    maps.update(torch.tensor([0]), torch.ones(1, 2), torch.full((2,), 0.1), step=1)
     values = maps.features(torch.arange(3))[:, 0]
     assert values.tolist() == pytest.approx([-0.2, -0.1, 0.0], abs=1e-6)
 
