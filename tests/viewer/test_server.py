@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import urllib.request
+from types import SimpleNamespace
 from urllib.parse import quote
 
 import numpy as np
@@ -377,6 +378,10 @@ def test_pictures_that_are_not_square_are_predicted_and_have_attention(store):
     assert answer["image"].lights.shape == (1, 40, 64, 3)
     weights = models.attention(context, {**request, "resolution": 64, "pixel": [0.99, 0.99]})["weights"]
     assert weights.shape[1] == len(scene.triangles) and (weights.sum(axis=1) <= 1.001).all() and weights.any()
+    context.kept["renderers"][""] = SimpleNamespace(model=object())  # a network of another kind
+    with pytest.raises(UserError, match="no attention"):
+        models.attention(context, {**request, "resolution": 64, "pixel": [0.5, 0.5]})
+    del context.kept["renderers"][""]
     with pytest.raises(UserError, match="aspect"):
         models.predict(context, {**request, "camera": {**camera, "aspect": 0}})
     scene.meta["aspect"] = [1.6] * len(scene.fov_deg)

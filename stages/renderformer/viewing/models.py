@@ -284,13 +284,12 @@ def attention(context: Context, arguments: Mapping[str, Any]) -> dict[str, Any]:
     model = renderer(context, arguments.get("checkpoint"))
     scene, side = edited_scene(context, arguments), resolution(arguments)
     x, y = numbers(arguments.get("pixel"), (2,), "pixel").clip(0, 1 - 1e-9)
+    if not hasattr(model.model, "view_transformer"):
+        raise UserError("this kind of network has no attention of pixels to show: choose a RenderFormer")
     height, width = scene.picture_size(0, side, model.model.config.resolution_multiple)
     rows, columns = (pixels // model.model.config.patch_size for pixels in (height, width))
     bundle = int(y * rows) * columns + int(x * columns)
-    try:
-        weights = cross_attention(model.model, scene, (height, width), str(model.device))[:, bundle]
-    except AttributeError as error:
-        raise UserError(f"this kind of network does not show its attention ({error})") from None
+    weights = cross_attention(model.model, scene, (height, width), str(model.device))[:, bundle]
     registers = weights.shape[1] - len(scene.triangles)
     return {"weights": weights[:, registers:].astype(np.float32), "registers": weights[:, :registers].sum(axis=1).tolist()}
 
