@@ -6,7 +6,8 @@ point here has another), takes requests that change or compute something only as
 to load anything from elsewhere (Content-Security-Policy). Names of artifacts, records and files are looked up, never joined to
 a path unseen (``pages``). Files of artifacts, whose pages have no origin, lie behind a word that only the viewer's pages know.
 
-Numerical work (torch, Mitsuba) is done by one thread, one request after the other.
+Native libraries are called from two threads that live as long as the viewer, never from those of requests: one reads and
+measures (OpenEXR, Embree, MeshLab), one renders (torch, Mitsuba), each one request after the other.
 """
 
 from __future__ import annotations
@@ -68,7 +69,8 @@ class Viewer:
         self.word = secrets.token_urlsafe(16)
         self._shown: OrderedDict[tuple[str, str | None], list[Any]] = OrderedDict()  # panels whose values may be asked for
         self.busy = 0  # requests whose numerical work is under way
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="numerical work")
+        self._reader = ThreadPoolExecutor(1, thread_name_prefix="reader")
+        self._renderer = ThreadPoolExecutor(1, thread_name_prefix="renderer")
 
     def panels(self, artifact: str, record: str | None) -> list[Any]:
         """Panels of an artifact or record; without an artifact, of the file that the viewer was started with."""
@@ -82,8 +84,10 @@ class Viewer:
         show = self.pages.views(shown.artifact)
         return list(show(shown) if show is not None else general.panels(shown))
 
-    def _remembered(self, artifact: str, record: str | None) -> list[Any]:
+    def _remembered(self, artifact: str, record: str | None, anew: bool = False) -> list[Any]:
         """The panels as they were last made: a page asks for what is Lazy in them one by one."""
+        if anew:
+            self._shown.pop((artifact, record), None)
         panels = self._shown.get((artifact, record))
         if panels is None:
             panels = self._shown[artifact, record] = self.panels(artifact, record)
@@ -105,10 +109,10 @@ class Viewer:
             facts = {"start": self.start, "file": None if path is None else path.name, "store": self.pages is not None}
             return {**facts, "word": self.word}
         if name == "panels":
-            self._shown.pop((artifact, record), None)
-            return pack(self._remembered(artifact, record))
+            return self._reader.submit(lambda: pack(self._remembered(artifact, record, anew=True))).result()
         if name == "lazy":
-            return pack(resolve(self._remembered(artifact, record), query.get("path", "")))
+            path = query.get("path", "")
+            return self._reader.submit(lambda: pack(resolve(self._remembered(artifact, record), path))).result()
         pages = self._pages()
         if name == "store":
             return pages.overview()
@@ -139,7 +143,7 @@ class Viewer:
             raise Refused(404, f"there is no action {name} of {system}")
         self.busy += 1
         try:
-            return self._worker.submit(lambda: pack(chosen.actions[name](self.context, arguments))).result()
+            return self._renderer.submit(lambda: pack(chosen.actions[name](self.context, arguments))).result()
         finally:
             self.busy -= 1
 
@@ -325,7 +329,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Security-Policy", policy)
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Referrer-Policy", "no-referrer")
-        self.send_header("Cross-Origin-Resource-Policy", "cross-origin" if self.path.startswith("/files/") else "same-origin")
+        of_store = self.path.startswith(("/api/", "/member/"))
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin" if of_store else "cross-origin")
         self.send_header("Cache-Control", "no-store")
 
     def _send(self, data: bytes, kind: str, policy: str = "default-src 'none'", status: int = 200) -> None:

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import urllib.request
+from types import SimpleNamespace
 from urllib.parse import quote
 
 import numpy as np
@@ -21,7 +22,7 @@ from stages.cli import main
 from stages.graphics.exr import decode_lights
 from stages.graphics.panels import Context, Facts, Lazy, general, pack, resolve, unpack
 from stages.renderformer.records import SceneRecord
-from stages.renderformer.viewing import models
+from stages.renderformer.viewing import models, scenes
 from stages.viewer.command import viewer_of
 from stages.viewer.server import Server, Viewer
 from tests.conftest import ROOT
@@ -364,6 +365,30 @@ def test_edits_change_what_they_name_and_nothing_else(store):
     for bad in ({"objects": {"0": scaled}}, {"objects": {"x": turn}}, {"lights": {"0": [1, None, 1]}}, {"materials": {"0": 1}}):
         with pytest.raises(UserError):
             models.edited(scene, bad)
+
+
+@pytest.mark.filterwarnings("ignore::stages.renderformer.inference.renderer.LimitWarning")
+def test_pictures_that_are_not_square_are_predicted_and_have_attention(store):
+    root, rf, _ = store
+    context = Context(Store(root))
+    scene = SceneRecord.from_record(rf["scene"].read("test-000000"))
+    camera = {"camera_to_world": scene.camera_to_world[0].tolist(), "fov_deg": 40.0, "aspect": 1.6}
+    request = {"scene": {"artifact": rf["scene"].name, "record": "test-000000"}, "checkpoint": "", "camera": camera}
+    answer = models.predict(context, {**request, "resolution": 64})
+    assert answer["image"].lights.shape == (1, 40, 64, 3)
+    weights = models.attention(context, {**request, "resolution": 64, "pixel": [0.99, 0.99]})["weights"]
+    assert weights.shape[1] == len(scene.triangles) and (weights.sum(axis=1) <= 1.001).all() and weights.any()
+    context.kept["renderers"][""] = SimpleNamespace(model=object())  # a network of another kind
+    with pytest.raises(UserError, match="no attention"):
+        models.attention(context, {**request, "resolution": 64, "pixel": [0.5, 0.5]})
+    del context.kept["renderers"][""]
+    with pytest.raises(UserError, match="aspect"):
+        models.predict(context, {**request, "camera": {**camera, "aspect": 0}})
+    scene.meta["aspect"] = [1.6] * len(scene.fov_deg)
+    camera = scenes.camera_of(scene, 0)
+    assert (camera.width, camera.height) == (512, 320) and camera.fy == pytest.approx(
+        160 / np.tan(np.radians(scene.fov_deg[0]) / 2)
+    )
 
 
 def test_a_system_without_views_is_shown_by_its_members_names(tmp_path):

@@ -33,7 +33,7 @@ class AttentionConfig(ProbeConfig):
     drawn_px: int = Field(192, ge=16, le=2048)  # of the pictures that weights are drawn on
 
 
-def cross_attention(model: Any, scene: SceneRecord, resolution: int, device: str = "cpu") -> np.ndarray:
+def cross_attention(model: Any, scene: SceneRecord, resolution: int | tuple[int, int], device: str = "cpu") -> np.ndarray:
     """(layers, rays, tokens) float32 weights, averaged over heads, of the scene's first camera: registers come first.
 
     A row sums to 1.

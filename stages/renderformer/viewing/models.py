@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 SUFFIXES = (*SCENES, *MESHES)
 SHIPPED = ""  # how the page names the model that ships
-MOST_SIDE, MOST_SPP = 2048, 4096  # of one request
+MOST_SIDE, MOST_SPP, MOST_ASPECT = 2048, 4096, 8  # of one request
+SIZE_MULTIPLE = 8  # of the shorter side of a picture, where no model asks for another
 KEPT_MODELS = 3
 KEPT_IMAGES = 8
 
@@ -147,7 +148,11 @@ def edited_scene(context: Context, arguments: Mapping[str, Any]) -> SceneRecord:
     fov = numbers(camera.get("fov_deg"), (), "fov_deg")
     if not 1 <= fov <= 170:
         raise UserError(f"fov_deg {fov:g}: expected 1 to 170")
-    return replace(scene, camera_to_world=pose[None].astype(np.float32), fov_deg=np.array([fov], np.float32))
+    aspect = numbers(camera.get("aspect", 1), (), "aspect")
+    if not 1 / MOST_ASPECT <= aspect <= MOST_ASPECT:
+        raise UserError(f"aspect {aspect:g}: expected 1/{MOST_ASPECT} to {MOST_ASPECT}, width over height")
+    meta = {**scene.meta, "aspect": [float(aspect)]}
+    return replace(scene, camera_to_world=pose[None].astype(np.float32), fov_deg=np.array([fov], np.float32), meta=meta)
 
 
 def edited(scene: SceneRecord, edits: Mapping[str, Any]) -> SceneRecord:
@@ -231,12 +236,15 @@ def trace(context: Context, arguments: Mapping[str, Any]) -> dict[str, Any]:
     from stages.renderformer.views import LAYERS
 
     arguments = without_gains(arguments)
-    scene, side = edited_scene(context, arguments), resolution(arguments)
+    scene = edited_scene(context, arguments)
+    model = context.kept.get("renderers", {}).get(arguments.get("checkpoint"))
+    multiple = SIZE_MULTIPLE if model is None else model.model.config.resolution_multiple
+    size = scene.picture_size(0, resolution(arguments), multiple)  # as large as the model's picture, to be compared
     spp = int(numbers(arguments.get("spp", 64), (), "spp"))
     if not 1 <= spp <= MOST_SPP:
         raise UserError(f"{spp} samples per pixel: expected 1 to {MOST_SPP:,}")
     began = time.perf_counter()
-    (view,) = render_views(scene, RenderSettings(side, spp), choose("auto"), [0])
+    (view,) = render_views(scene, RenderSettings(size, spp), choose("auto"), [0])
     seconds = time.perf_counter() - began
     lights = np.ascontiguousarray(view.lights, np.float32)
     keep(context, "traced", arguments, lights)
@@ -276,12 +284,12 @@ def attention(context: Context, arguments: Mapping[str, Any]) -> dict[str, Any]:
     model = renderer(context, arguments.get("checkpoint"))
     scene, side = edited_scene(context, arguments), resolution(arguments)
     x, y = numbers(arguments.get("pixel"), (2,), "pixel").clip(0, 1 - 1e-9)
-    across = side // model.model.config.patch_size
-    bundle = int(y * across) * across + int(x * across)
-    try:
-        weights = cross_attention(model.model, scene, side, str(model.device))[:, bundle]
-    except AttributeError as error:
-        raise UserError(f"this kind of network does not show its attention ({error})") from None
+    if not hasattr(model.model, "view_transformer"):
+        raise UserError("this kind of network has no attention of pixels to show: choose a RenderFormer")
+    height, width = scene.picture_size(0, side, model.model.config.resolution_multiple)
+    rows, columns = (pixels // model.model.config.patch_size for pixels in (height, width))
+    bundle = int(y * rows) * columns + int(x * columns)
+    weights = cross_attention(model.model, scene, (height, width), str(model.device))[:, bundle]
     registers = weights.shape[1] - len(scene.triangles)
     return {"weights": weights[:, registers:].astype(np.float32), "registers": weights[:, :registers].sum(axis=1).tolist()}
 

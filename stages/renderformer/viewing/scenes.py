@@ -44,9 +44,11 @@ def space(scene: SceneRecord, images: Mapping[int, Lazy], reference: Mapping[str
     pane = Pane("scene", [surface(scene)], eyes(scene, images))
     objects = [{"name": entry.get("name", f"object {i}"), "kind": entry.get("kind", "object")}
                for i, entry in enumerate(scene.meta.get("objects", ()))]  # fmt: skip
-    note = "Textures are shown as the mean of each triangle." if scene.textured else ""
-    first = min(images, default=0)
-    return Space(title, [pane], eye=first if len(scene.fov_deg) else None, note=note, objects=objects, scene=dict(reference))
+    notes = list(scene.meta.get("notes", ()))
+    if scene.textured:
+        notes.append("textures are shown as the mean of each triangle")
+    eye = min(images, default=0) if len(scene.fov_deg) else None
+    return Space(title, [pane], eye=eye, note="; ".join(notes), objects=objects, scene=dict(reference))
 
 
 def surface(scene: SceneRecord) -> Surface:
@@ -62,10 +64,14 @@ def surface(scene: SceneRecord) -> Surface:
 
 
 def eyes(scene: SceneRecord, images: Mapping[int, Lazy]) -> list[Eye]:
-    return [
-        Eye(f"camera {i}", Camera.from_fov(SIDE, SIDE, float(fov), pose), images.get(i))
-        for i, (pose, fov) in enumerate(zip(scene.camera_to_world, scene.fov_deg, strict=True))
-    ]
+    return [Eye(f"camera {i}", camera_of(scene, i), images.get(i)) for i in range(len(scene.fov_deg))]
+
+
+def camera_of(scene: SceneRecord, view: int) -> Camera:
+    """One of the scene's cameras, for a picture of `SIDE` pixels on its longer side; the field of view is across the height."""
+    height, width = scene.picture_size(view, SIDE)
+    focal = 0.5 * height / np.tan(np.radians(scene.fov_deg[view]) / 2)
+    return Camera(width, height, focal, focal, width / 2, height / 2, scene.camera_to_world[view].astype(float))
 
 
 def lazy_image(artifact: Artifact, record_id: str, view: int) -> Lazy:

@@ -9,6 +9,8 @@ const GAIN = 5; // of the difference
 const SIZES = [64, 128, 256, 512];
 const SHOWS = [["preview", "Preview"], ["stored", "Stored"], ["model", "Model"], ["traced", "Path traced"], ["difference", "Difference"]];
 
+const sizeOf = ({ lights: { shape } }) => `${shape[2]} x ${shape[1]}`;
+
 export class Model {
   constructor(space) {
     this.space = space;
@@ -230,7 +232,7 @@ export class Model {
   request() {
     const { pose, lens, fov } = this.space.sight;
     return { scene: this.scene, checkpoint: this.model, edits: { ...this.edits, lights: Object.fromEntries(this.gains.map((gain, l) => [l, gain])) },
-      camera: { camera_to_world: matrixOf(pose), fov_deg: lens ? (2 * Math.atan(lens.y) * 180) / Math.PI : fov } };
+      camera: { camera_to_world: matrixOf(pose), fov_deg: lens ? (2 * Math.atan(lens.y) * 180) / Math.PI : fov, aspect: lens?.aspect ?? 1 } };
   }
 
   wanted() { const { scene, edits: { objects, materials }, camera } = this.request(); return JSON.stringify([scene, objects, materials, camera]); }
@@ -253,7 +255,7 @@ export class Model {
           if (turn !== this.asked) return;
           this.fresh = wanted;
           this.put(this.predicted, answer.image);
-          this.told.textContent = `model: ${resolution} x ${resolution} in ${answer.seconds.toFixed(2)} s${answer.notes.map((note) => ` · ${note}`).join("")}`;
+          this.told.textContent = `model: ${sizeOf(answer.image)} in ${answer.seconds.toFixed(2)} s${answer.notes.map((note) => ` · ${note}`).join("")}`;
           this.space.overlay();
         }
       }
@@ -264,7 +266,7 @@ export class Model {
         this.fresh = wanted;
         this.traced.gains = this.gains;
         this.put(this.traced, answer.image);
-        this.told.textContent = `path traced: ${this.size} x ${this.size}, ${this.spp} samples per pixel in ${answer.seconds.toFixed(1)} s`;
+        this.told.textContent = `path traced: ${sizeOf(answer.image)}, ${this.spp} samples per pixel in ${answer.seconds.toFixed(1)} s`;
         this.space.overlay();
         if (source === "difference") {
           const scores = await act(this.system, "compare", { ...request, resolution: this.size });
@@ -296,7 +298,7 @@ export class Model {
 
   subtract() {
     const [a, b] = [this.predicted.canvas, this.traced.canvas];
-    if (!this.predicted.image || !this.traced.image || a.width !== b.width) return;
+    if (!this.predicted.image || !this.traced.image || a.width !== b.width || a.height !== b.height) return;
     const { width, height } = a, [p, q] = [a, b].map((canvas) => canvas.getContext("2d", { willReadFrequently: true }).getImageData(0, 0, width, height));
     for (let i = 0; i < p.data.length; i++) p.data[i] = i % 4 === 3 ? 255 : GAIN * Math.abs(p.data[i] - q.data[i]);
     this.difference.width = width;

@@ -42,6 +42,13 @@ const pictures = ({ sources, slider: one }, page) => {
   return h("div", {}, slider("Step", { max: last, step: 1, value: last, show: (i) => entries[i][0], on: (i) => { image.src = page.source(entries[i][1]); } }), h("figure", { class: "shot" }, image));
 };
 
+const spaceOf = (panel, page) => {
+  const space = new Space(panel, page);
+  space.ready = space.ready.catch((error) => { space.element.replaceChildren(failure(error)); });
+  page.spaces.push(space);
+  return Object.assign(space.element, { free: space.free });
+};
+
 const KINDS = {
   facts: ({ values }) => facts(values),
   words: ({ text }) => h("pre", {}, text),
@@ -64,10 +71,17 @@ const KINDS = {
     return box;
   },
   space: (panel, page) => {
-    const space = new Space(panel, page);
-    space.ready = space.ready.catch((error) => { space.element.replaceChildren(failure(error)); });
-    page.spaces.push(space);
-    return Object.assign(space.element, { free: space.free });
+    if (!page.spaces.length) return spaceOf(panel, page);
+    const box = h("div", { class: "waiting" }, h("p", { class: "soft" }, "loading ..")); // drawn when it is scrolled to
+    const watcher = new IntersectionObserver((entries) => {
+      if (!entries.some((entry) => entry.isIntersecting)) return;
+      watcher.disconnect();
+      const element = spaceOf(panel, page);
+      page.freed.push(element.free);
+      box.replaceWith(element);
+    });
+    watcher.observe(box);
+    return Object.assign(box, { free: () => watcher.disconnect() });
   },
 };
 const FOLDED = ["facts", "words"]; // below the pictures, closed where there are pictures
