@@ -33,7 +33,8 @@ class ScaffoldConfig(StageConfig):
     trim_m: float = Field(0.6, gt=0)  # reconstructed surface farther than this from all points goes
     carve: bool = True  # drop what LiDAR beams went through
     carve_m: float = Field(0.3, gt=0)  # a beam may meet the surface so much before its end
-    longest_m: float = Field(8.0, gt=0)  # longest side of a triangle of terrain, seen from above
+    longest_m: float = Field(40.0, gt=0)  # longest side of a triangle of terrain, seen from above: bare ground has few points
+    outlier_m: float = Field(8.0, gt=0)  # points of terrain so far above or below their neighbours go
     weld_m: float = Field(0.02, gt=0)  # vertices in one cell of this size become one
     faces: int | None = Field(150_000, ge=100)  # about this many after QSlim; null: all
     speck_faces: int = Field(25, ge=0)  # connected pieces of fewer faces go
@@ -123,7 +124,8 @@ def _surface(
     points, viewers = reconstruct.thin(points, voxel, viewers)
     stated = {"source": source, "points": len(points)}
     if source == "terrain":
-        return reconstruct.terrain(points, np.array(info.up), config.longest_m * info.metre), stated
+        longest, outlier = config.longest_m * info.metre, config.outlier_m * info.metre
+        return reconstruct.terrain(points, np.array(info.up), longest, outlier), stated
     point_normals = reconstruct.normals(points, viewers, config.neighbours)
     mesh = reconstruct.poisson(points, point_normals, config.depth, config.trim_m * info.metre)
     if config.carve and info.points == "lidar":

@@ -857,7 +857,7 @@ def test_the_stage_only_dispatches(tmp_path, monkeypatch):
     from stages.neuras import s00_capture
 
     nerfstudio(tmp_path / "set")
-    monkeypatch.setattr(s00_capture, "_source", lambda config: FakeSource())
+    monkeypatch.setattr(s00_capture, "_source", lambda config, prepared=None: FakeSource())
     monkeypatch.setattr(Capture, "identity", lambda self, config, hash_file: {})
     artifact, _ = run(tmp_path)
     found = {frame.id: (frame.split, frame.shift, float(frame.depth[0, 0])) for frame in frames(artifact)}

@@ -8,6 +8,7 @@ import trimesh
 
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster
+from stages.graphics.geometry import measure
 from stages.neuras.rasterizing.footprints import footprint
 from stages.neuras.rasterizing.texels import sheet, texels
 from stages.neuras.records import Mesh
@@ -86,10 +87,14 @@ def test_terrain_faces_up_and_drops_outliers(up):
     axes = np.linalg.svd(np.array(up)[None])[2][1:]
     points = flat[:, :1] * axes[0] + flat[:, 1:2] * axes[1] + flat[:, 2:] * np.array(up)
     points = np.concatenate([points, points[:1] + 50 * np.array(up)])
-    mesh = reconstruct.terrain(points, np.array(up), 3.0)
+    mesh = reconstruct.terrain(points, np.array(up), 3.0, 3.0)
     assert len(mesh.vertices) == 400
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     assert (np.cross(b - a, c - a) @ np.array(up)).min() > 0
+    bare = points[np.linalg.norm(points @ axes.T - 10, axis=1) > 4]  # no points on a round piece of ground
+    open_, closed = (reconstruct.terrain(bare, np.array(up), longest, 3.0) for longest in (3.0, 20.0))
+    area = [measure.face_areas(mesh.vertices @ axes.T @ axes, mesh.faces).sum() for mesh in (open_, closed)]
+    assert area[0] < 0.9 * area[1] and area[1] == pytest.approx(19 * 19)
 
 
 def test_welding_and_collapsing_keep_the_shape():

@@ -62,16 +62,16 @@ def poisson(points: np.ndarray, point_normals: np.ndarray, depth: int, trim: flo
     return Mesh.compact(vertices, faces[near[faces].all(axis=1)])
 
 
-def terrain(points: np.ndarray, up: np.ndarray, longest: float) -> Mesh:
+def terrain(points: np.ndarray, up: np.ndarray, longest: float, outlier: float) -> Mesh:
     """A Delaunay triangulation of the points as seen from above, for what is flat, such as a flight's points.
 
-    Points that stand out from their neighbours' median height by more than ``longest`` are outliers and go, and so do
-    triangles with a side seen from above longer than that.
+    Points that stand out from their neighbours' median height by more than ``outlier`` go, and so do triangles with a side
+    seen from above longer than ``longest``.
     """
     across = np.linalg.svd(up[None])[2][1:]
     plan, height = points @ across.T, points @ up
     near = cKDTree(plan).query(plan, k=min(9, len(plan)))[1]
-    kept = np.abs(height - np.median(height[near], axis=1)) <= longest
+    kept = np.abs(height - np.median(height[near], axis=1)) <= outlier
     points, plan = points[kept], plan[kept]
     faces = Delaunay(plan).simplices.astype(np.int64)
     sides = np.linalg.norm(plan[faces] - plan[faces[:, [1, 2, 0]]], axis=-1).max(axis=1)
