@@ -34,6 +34,7 @@ HABITS: dict[str, bytes] = {
     "latin1.obj": b"o caf\xe9\n" + (V + F).encode(),
     "names-with-spaces.obj": f"mtllib my colours.mtl\no a box f 1\ng An f Three Other Thing\n{V}usemtl my red\n{F}".encode(),
     "normals-and-uv.obj": (V + "vt 0 0\nvn 0 0 1\n" + re.sub(r" (\d)", r" \1/1/1", F)).encode(),
+    "two-corners.obj": (V + "v 9 9 9\n" * 9 + "vt 0 0\n" + re.sub(r" (\d)", r" \1/1", F) + "f 16/1 17/1\n").encode(),
     "normals.obj": (V + "vn 0 0 1\n" + re.sub(r" (\d)", r" \1//1", F)).encode(),
     "mixed-corners.obj": (V + "vt 0 0\nvn 0 0 1\n" + F.replace("f 1 2", "f 1/1/1 2//1").replace("f 5 7", "f 5/1 7/")).encode(),
     "points-and-lines.obj": (V + "p 1 2\nl 1 2 3\n" + F + "f 1 2\n").encode(),

@@ -9,15 +9,25 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from pipeline.errors import Reject
-from stages.graphics.geometry import load
-from tests.graphics.habits import HABITS
+from stages.graphics.geometry import load, measure
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
-EXPLAINED: dict[str, str] = {
+EXPLAINED = {  # what the other reader does otherwise
+    "cr-line-ends.ply": "cannot read it: lines of the header end with CR",
+    "leading-blank.off": "cannot read it: counts in the line of the word OFF",
+    "comments.off": "cannot read it: comments before the header",
+    "faces-across-lines.off": "crashes: faces go on in the next line",
+    "ngons.off": "turns a hexagon inside out: its volume is half of the prism's",
+    "wallhole.obj": "leaves out polygons of eight corners, some of them in one line",
+    "quantised-beside-float.glb": "does not divide normalised integers",
+    "sparse-changes.glb": "does not apply the changes of a sparse accessor",
+    "sparse-only.glb": "does not apply the changes of a sparse accessor",
 }  # fmt: skip
+CRASHES = {"faces-across-lines.off"}  # a segmentation fault of pymeshlab, which would end the tests
 
 
 def by_pymeshlab(path: Path) -> Mesh:
@@ -45,46 +55,43 @@ def joined(parts: list[Mesh]) -> Mesh:
 
 
 def measures(mesh: Mesh) -> dict[str, np.ndarray]:
-    """vertices: how many positions, to a millionth of the size, triangles with an area use; sides; area; volume."""
+    """Of the triangles with an area: how many positions they use, to a millionth of the size; sides; area; volume."""
     corners = np.asarray(mesh[0], np.float64)[mesh[1]]
     corners = corners / np.ptp(corners.reshape(-1, 3), axis=0).max()
-    first, a, b = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal = np.cross(a, b)
-    solid = np.linalg.norm(normal, axis=1) > 1e-14
-    used = corners[solid].reshape(-1, 3)
+    corners = corners[np.linalg.norm(measure.normal_vectors(corners), axis=1) > 1e-14]
+    used = corners.reshape(-1, 3)
+    used = (used - used.min(axis=0)) / np.ptp(used, axis=0).max()
+    normals = measure.normal_vectors(used.reshape(-1, 3, 3))
     return {
-        "vertices": np.array(len(np.unique((used - used.min(axis=0)).round(6), axis=0))),
+        "vertices": np.array(len(np.unique(used.round(6), axis=0))),
         "sides": np.ptp(used, axis=0),
-        "area": np.linalg.norm(normal, axis=1).sum() / 2,
-        "volume": ((first - used.mean(axis=0)) * normal)[solid].sum() / 6,
+        "area": np.linalg.norm(normals, axis=1).sum() / 2,
+        "volume": ((used[::3] - used.mean(axis=0)) * normals).sum() / 6,
     }
 
 
-def files(shared_data: Path, tmp_path: Path) -> list[Path]:
-    for name, data in HABITS.items():
-        (tmp_path / name).write_bytes(data)
-    roots = [shared_data / name for name in ("meshes", "scenes", "cases")] + [tmp_path]
-    return sorted(path for root in roots for path in root.rglob("*") if path.suffix.lower() in load.SUFFIXES)
-
-
-def test_other_readers_see_the_same(shared_data: Path, tmp_path: Path) -> None:
-    differences: dict[str, str] = {}
-    compared = 0
-    for path in files(shared_data, tmp_path):
+@pytest.mark.slow
+def test_other_readers_see_the_same(shared_data: Path) -> None:
+    """In every file below the sample data; what is written in tests/graphics/habits.py, no other reader reads whole."""
+    differences, compared = {}, 0
+    paths = (path for path in sorted(shared_data.rglob("*")) if path.suffix.lower() in load.SUFFIXES)
+    for path in paths:
         try:
             ours = load.load_mesh(path, path.parent, 1 << 28, 4_000_000)
         except Reject:
             continue
+        if path.name in CRASHES:
+            differences[path.name] = "crashes"
+            continue
         other = by_trimesh if path.suffix.lower() in (".glb", ".gltf") else by_pymeshlab
         try:
-            theirs = measures(other(path))
+            found, theirs = measures((ours.vertices, ours.faces)), measures(other(path))
         except Exception as error:
-            differences[path.name] = f"{other.__name__} cannot read it: {str(error)[:60]}"
+            differences[path.name] = f"{other.__name__} cannot read it: {str(error)[:200]}"
             continue
-        found = measures((ours.vertices, ours.faces))
-        wrong = [name for name in found if not np.allclose(found[name], theirs[name], rtol=1e-4, atol=1e-5)]
         compared += 1
+        wrong = [name for name in found if not np.allclose(found[name], theirs[name], rtol=1e-4, atol=1e-5)]
         if wrong:
             differences[path.name] = "; ".join(f"{name}: {found[name]}, {other.__name__} {theirs[name]}" for name in wrong)
-    print(compared)
-    assert differences == {}
+    assert set(differences) == set(EXPLAINED), differences
+    assert compared > 100

@@ -462,3 +462,40 @@ def test_a_sliver_is_too_thin_and_a_leaf_is_not(tmp_path: Path) -> None:
                 mesh_of(tmp_path / "a.obj")
     (tmp_path / "b.obj").write_bytes(V.replace(" 0.5", " 0").encode() + F.encode())
     assert len(mesh_of(tmp_path / "b.obj").faces) == 4  # without thickness, but not thin in two directions
+
+
+RINGS = {  # corners of a polygon in the plane, counter-clockwise, and its area
+    "arrow": ([[0, 0], [2, 1], [0, 2], [0.5, 1]], 1.5),
+    "arrow-turned": ([[2, 1], [0, 2], [0.5, 1], [0, 0]], 1.5),
+    "hook": ([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]], 3.0),
+    "hook-turned": ([[1, 1], [1, 2], [0, 2], [0, 0], [2, 0], [2, 1]], 3.0),
+    "comb": ([[0, 0], [5, 0], [5, 2], [4, 2], [4, 1], [3, 1], [3, 2], [2, 2], [2, 1], [1, 1], [1, 2], [0, 2]], 8.0),
+    "with-corners-in-line": ([[0, 0], [1, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2], [0, 1]], 3.0),
+    "keyhole": ([[0, 0], [4, 0], [4, 4], [0, 4], [0, 0], [1, 1], [1, 3], [3, 3], [3, 1], [1, 1]], 12.0),
+}
+
+
+@pytest.mark.parametrize("name", RINGS)
+def test_polygons_with_inward_corners_cover_their_area_once(name: str, tmp_path: Path) -> None:
+    ring, area = RINGS[name]
+    for turn in (
+        [[1, 0, 0], [0, 1, 0]],
+        [[0, 1, 0], [0, 0, 1]],
+        [[0, 0, 1], [1, 0, 0]],
+        [[-1, 0, 0], [0, 1, 0]],
+        [[0, 0, 1], [0, 1, 0]],
+    ):
+        points = np.array(ring) @ np.array(turn, float)
+        rows = [" ".join(map(str, p)) for p in points.tolist()]
+        count = len(rows)
+        (tmp_path / "a.off").write_text(
+            f"OFF {count} 1 0\n" + "\n".join(rows) + f"\n{count} {' '.join(map(str, range(count)))}\n"
+        )
+        (tmp_path / "a.obj").write_text(
+            "".join(f"v {row}\n" for row in rows) + f"f {' '.join(map(str, range(1, count + 1)))}\n"
+        )
+        for file in ("a.off", "a.obj"):
+            mesh = mesh_of(tmp_path / file)
+            normals = measure.normal_vectors(mesh.vertices[mesh.faces])
+            assert np.linalg.norm(normals, axis=1).sum() / 2 == pytest.approx(area), (file, turn)
+            assert np.allclose(normals.sum(axis=0) / 2, area * np.cross(*turn)), (file, turn)

@@ -1,8 +1,8 @@
 """Geometry: what *collect*, *remesh* and *decimate* compute.
 
-``load``        a mesh file of any supported format as checked arrays, or a Reject
-``procedural``  families of made-up shapes
-``catalogue``   ids, splits, duplicates: what is decided over all objects
+``load``        a mesh file of any supported format as checked arrays, or a Reject; its readers are in ``formats``
+``colours``     base colours of a mesh file, their images and record
+``side_files``  the files beside a mesh file that decide what is made of it
 ``measure``     areas, volumes, manifoldness, distances, visibility
 ``remesher``    unsigned distance, flood fill from outside, marching cubes, pull-back
 ``decimator``   quadric edge collapse to a ladder of budgets

@@ -332,7 +332,8 @@ def layout(accessor: dict[str, Any]) -> tuple[int, tuple[int, int], np.dtype]:
 def numbers(values: np.ndarray, accessor: dict[str, Any]) -> np.ndarray:
     """Values as stored in the numbers that they stand for: float64, or int64 for integers that are not normalised."""
     if values.dtype.kind == "f":
-        return values.astype(np.float64)
+        with np.errstate(invalid="ignore"):  # some patterns of bits that are no number
+            return values.astype(np.float64)
     if accessor.get("normalized") is not True or accessor["componentType"] == 5125:
         return values.astype(np.int64)
     most = np.iinfo(np.dtype(DTYPES[accessor["componentType"]])).max

@@ -190,7 +190,7 @@ def _part(points: np.ndarray, faces: _Faces, lines: dict[bytes, _Lines]) -> tupl
     used = np.repeat(faces.sizes > 2, faces.sizes)
     if not used.any():
         return None, np.zeros((0, 3, 2), np.int64)
-    corners = faces.corners[:, 0].copy()
+    corners = np.where(used, faces.corners[:, 0], 0)
     has_uv, has_normal = (bool((faces.corners[used, column] >= 0).all()) for column in (1, 2))
     has_normal = has_normal and (has_uv or bool(lines[b"vn"].values))
     if has_uv or has_normal:
@@ -201,7 +201,7 @@ def _part(points: np.ndarray, faces: _Faces, lines: dict[bytes, _Lines]) -> tupl
         corners[used] = rows[:, 0]
         points = points[vertex]
     regular = len({*faces.sizes.tolist()}) == 1 and len(np.unique((faces.corners >= 0).sum(axis=1))) == 1
-    places, owner = triangulate(faces.sizes, in_order=not regular)
+    places, owner = triangulate(faces.sizes, points[corners], in_order=not regular)
     triangles = corners[places]
     kept, triangles = np.unique(triangles, return_inverse=True)
     triangles = triangles.reshape(-1, 3)

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.errors import Reject
 from stages.graphics.geometry.colours import Look, srgb_colours
 from stages.graphics.geometry.formats.parts import Part, Source, checked_part
-from stages.graphics.geometry.formats.polygons import triangulate
+from stages.graphics.geometry.formats.polygons import points_at, triangulate
 from stages.graphics.geometry.formats.text import Words, plain_text, shown
 
 KEYWORD = re.compile(rb"\s*(?P<kind>(?P<uv>ST)?(?P<colour>C)?(?P<normal>N)?4?n?)OFF(?![A-Za-z])(?P<binary>[ \t]*BINARY)?")
@@ -117,7 +117,7 @@ class _Off:
         sizes = words.integers(starts)
         places = np.repeat(starts + 1 - np.cumsum([0, *sizes[:-1]])[: len(sizes)], sizes) + np.arange(sizes.sum())
         corners = words.integers(places)
-        triangles, owner = triangulate(sizes)
+        triangles, owner = triangulate(sizes, points_at(rows[:, :3], corners))
         part = checked_part(
             rows[:, :3], corners[triangles],
             lambda vertex: words.place(self.first + vertex * width),

@@ -11,7 +11,7 @@ from pipeline.errors import Reject
 from stages.graphics.geometry.colours import Look, srgb_colours
 from stages.graphics.geometry.formats.faults import at
 from stages.graphics.geometry.formats.parts import Part, Source, checked_part
-from stages.graphics.geometry.formats.polygons import triangulate
+from stages.graphics.geometry.formats.polygons import points_at, triangulate
 from stages.graphics.geometry.formats.text import BYTE_ORDER_MARKS, Words, plain_text, shown
 
 TYPES = {
@@ -71,7 +71,7 @@ def read(data: bytes, source: Source) -> list[Part]:
         return []
     if header.texture:
         source.note(f"image {header.texture[:80]}: images of PLY files are not read")
-    triangles, owner = triangulate(sizes)
+    triangles, owner = triangulate(sizes, points_at(points, corners))
     of_face = owner_element.name == "face"
     points, split = _split(points, corners, owner_element) if of_face and len(np.unique(sizes)) == 1 else (points, corners)
     part = checked_part(
