@@ -424,13 +424,22 @@ class GuidedNetwork(Network):
         returned = joint_masking(surface.alpha, eye, away) / masking(surface.alpha, eye)
         there = hits.there * surface.there * (away > 0)[..., None]
         return Reflected(
-            second, ways, light * there, self._highlight(scenes, second, hits) * there, returned[..., None] * there
+            second,
+            ways,
+            light * there,
+            self._highlight(scenes, second, hits, surface.alpha) * there,
+            returned[..., None] * there,
         )
 
-    def _highlight(self, scenes: Scenes, surface: Surface, hits: Hits) -> Tensor:
-        """(B, M, 3): the lights in a white lobe of surfaces, as far as the triangles' points see them."""
+    def _highlight(self, scenes: Scenes, surface: Surface, hits: Hits, before: Tensor) -> Tensor:
+        """(B, M, 3): the lights in a white lobe of surfaces, as far as the triangles' points see them.
+
+        before: (B, M), GGX width of the surface that the ray comes from. It blurs what it shows, so highlights are widened by
+        it: rays are few, and would find narrow ones rarely, and then as bright dots.
+        """
+        alpha = torch.sqrt(surface.alpha.square() + before.square()).clamp(max=1)
         factor = vector_form_factor(surface.position[:, :, None], scenes.light_corners[:, None])
-        shape = specular_light(factor, surface.normal[:, :, None], surface.to_eye[:, :, None], surface.alpha[:, :, None])
+        shape = specular_light(factor, surface.normal[:, :, None], surface.to_eye[:, :, None], alpha[:, :, None])
         if self.config.guide.visibility:
             shape = shape * hits.between_points(scenes.seen)
         return (shape[..., None] * scenes.radiance[:, None]).sum(dim=-2)
