@@ -74,7 +74,7 @@ eval: setup
 endif
 
 probes: setup
-	@$(RUN) -m pipeline stage=probe probe=$(subst $(EMPTY) $(EMPTY),$(COMMA),$(PROBES)) -m $(ARGS)
+	@$(RUN) -m pipeline stage=probe $(if $(DEFAULT),shard.guides=true) probe=$(subst $(EMPTY) $(EMPTY),$(COMMA),$(PROBES)) -m $(ARGS)
 
 sweep: setup
 	@$(RUN) -m stages.cli sweep $(TABLE) $(ARGS)

@@ -154,24 +154,28 @@ class Head(nn.Module):
         self.layers = nn.ModuleList(HeadLayer(dim) for _ in range(config.head_layers))
         self.norm = RMSNorm(dim, LAYER_EPS)
         self.output = nn.Linear(dim, 7)  # E, R, gate
-        self.to_light = nn.Linear(dim, LIGHT_DIM)
-        self.of_light = nn.Linear(LIGHT_FEATURES, LIGHT_DIM)
-        self.light_hidden = nn.Linear(LIGHT_DIM, LIGHT_DIM)
-        self.light_output = nn.Linear(LIGHT_DIM, 2)
+        self.corrects_lights = config.guide.light
+        if self.corrects_lights:
+            self.to_light = nn.Linear(dim, LIGHT_DIM)
+            self.of_light = nn.Linear(LIGHT_FEATURES, LIGHT_DIM)
+            self.light_hidden = nn.Linear(LIGHT_DIM, LIGHT_DIM)
+            self.light_output = nn.Linear(LIGHT_DIM, 2)
         self.start_at_zero()
 
     def start_at_zero(self) -> None:
         """Let the network say nothing: the image is the closed form."""
-        for last in (self.output, self.light_output):
+        for last in (self.output, self.light_output) if self.corrects_lights else (self.output,):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
-    def forward(self, features: Tensor, lights: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, M, F) pixels, (B, M, L, LIGHT_FEATURES) their lights -> (B, M, 7), (B, M, L, 2)."""
+    def forward(self, features: Tensor, lights: Tensor) -> tuple[Tensor, Tensor | None]:
+        """(B, M, F) pixels, (B, M, L, LIGHT_FEATURES) their lights -> (B, M, 7), and (B, M, L, 2) if there are closed forms."""
         x = self.input(features)
         for layer in self.layers:
             x = run_layer(layer, x)
         x = self.norm(x)
+        if not self.corrects_lights:
+            return self.output(x), None
         of_light = F.silu(self.to_light(x)[:, :, None] + self.of_light(lights))
         return self.output(x), self.light_output(F.silu(self.light_hidden(of_light)))
 
@@ -344,7 +348,7 @@ class GuidedNetwork(Network):
         if self.config.tokens == "encoder":
             features.append(self._gather(encoded, pixels, known))
         outputs, corrections = self.head(torch.cat(features, dim=-1), known.lights)
-        return self._compose(encoded.scenes, known, outputs.float(), corrections.float())
+        return self._compose(encoded.scenes, known, outputs.float(), corrections)
 
     def _gather(self, encoded: Encoded, pixels: Pixels, known: Known) -> Tensor:
         """(B, M, d): what each pixel's bundle gathers from the tokens, by attention at the mean position that it hits."""
@@ -420,13 +424,22 @@ class GuidedNetwork(Network):
         returned = joint_masking(surface.alpha, eye, away) / masking(surface.alpha, eye)
         there = hits.there * surface.there * (away > 0)[..., None]
         return Reflected(
-            second, ways, light * there, self._highlight(scenes, second, hits) * there, returned[..., None] * there
+            second,
+            ways,
+            light * there,
+            self._highlight(scenes, second, hits, surface.alpha) * there,
+            returned[..., None] * there,
         )
 
-    def _highlight(self, scenes: Scenes, surface: Surface, hits: Hits) -> Tensor:
-        """(B, M, 3): the lights in a white lobe of surfaces, as far as the triangles' points see them."""
+    def _highlight(self, scenes: Scenes, surface: Surface, hits: Hits, before: Tensor) -> Tensor:
+        """(B, M, 3): the lights in a white lobe of surfaces, as far as the triangles' points see them.
+
+        before: (B, M), GGX width of the surface that the ray comes from. It blurs what it shows, so highlights are widened by
+        it: rays are few, and would find narrow ones rarely, and then as bright dots.
+        """
+        alpha = torch.sqrt(surface.alpha.square() + before.square()).clamp(max=1)
         factor = vector_form_factor(surface.position[:, :, None], scenes.light_corners[:, None])
-        shape = specular_light(factor, surface.normal[:, :, None], surface.to_eye[:, :, None], surface.alpha[:, :, None])
+        shape = specular_light(factor, surface.normal[:, :, None], surface.to_eye[:, :, None], alpha[:, :, None])
         if self.config.guide.visibility:
             shape = shape * hits.between_points(scenes.seen)
         return (shape[..., None] * scenes.radiance[:, None]).sum(dim=-2)
@@ -472,7 +485,7 @@ class GuidedNetwork(Network):
         offset = scenes.light_corners.mean(dim=2)[:, None] - surface.position[:, :, None]
         return torch.cat([direction, offset, torch.stack(parts, dim=-1)], dim=-1)
 
-    def _compose(self, scenes: Scenes, known: Known, outputs: Tensor, corrections: Tensor) -> Tensor:
+    def _compose(self, scenes: Scenes, known: Known, outputs: Tensor, corrections: Tensor | None) -> Tensor:
         """The image (B, M, 3) from the head's outputs."""
         rays, direct, radiance = known.rays, known.direct, scenes.radiance[:, None]
         indirect, reflected, gate = outputs.split([3, 3, 1], dim=-1)
@@ -486,9 +499,9 @@ class GuidedNetwork(Network):
             return ((closed_form * seen)[..., None] * radiance).sum(dim=-2)
 
         diffuse, specular = spread(self.positive(indirect)), spread(self.positive(reflected))
-        if self.config.guide.light:
-            diffuse = diffuse + light(direct.diffuse, corrections[..., 0])
-            specular = specular + light(direct.specular, corrections[..., 1])
+        if corrections is not None:
+            diffuse = diffuse + light(direct.diffuse, corrections[..., 0].float())
+            specular = specular + light(direct.specular, corrections[..., 1].float())
         specular = specular + spread(self.positive(1 + gate) * known.reflected)
         image = (rays.diffuse * diffuse + rays.specular * specular) * rays.there
         return _mean(image, 1) * scenes.scale[:, None, None]
