@@ -235,7 +235,7 @@ def test_exposure_is_found_on_the_left_half_and_scored_on_the_right(run):
 
 
 def test_without_opengl_and_browser_the_report_says_what_is_missing(run, no_opengl, monkeypatch):
-    monkeypatch.setattr(browser, "find_browser", lambda: None)
+    monkeypatch.setattr("stages.graphics.browser.find_browser", lambda: None)
     artifacts, _ = run(evaluate={**QUICK, "video_frames": 2, "page_views": 2, "depth_tolerance": 0.06})
     views = views_of(artifacts["evaluate"])
     assert all(set(row["scores"]) == {"ours", "warping"} and not row["agreement"] for row in views.values())

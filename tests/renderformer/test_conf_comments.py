@@ -14,7 +14,7 @@ from pipeline.stage import load_system
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SETTING = re.compile(r"(?P<indent> *)(?P<key>\w+):(?P<value>[^#]*)(?:#(?P<comment>.*))?$")
-SYSTEMS = [load_system(name) for name in ("renderformer",)]
+SYSTEMS = {name: load_system(name) for name in ("renderformer", "neuras")}
 
 
 def alternatives(comment: str) -> list[str]:
@@ -56,24 +56,25 @@ def accepted(annotation: Any, word: str) -> bool:
 
 
 CASES = [
-    pytest.param(stage, keys, words, id=f"{path.relative_to(CONF)}:{'.'.join(keys)}")
-    for path in sorted(CONF.rglob("*.yaml"))
-    for stage in [next((part for part in path.relative_to(CONF).parts if part in SYSTEMS[0].modules), None)]
+    pytest.param(system, stage, keys, words, id=f"{path.relative_to(CONF)}:{'.'.join(keys)}")
+    for name, system in SYSTEMS.items()
+    for path in sorted((CONF / name).rglob("*.yaml"))
+    for stage in [next((part for part in path.relative_to(CONF).parts if part in system.modules), None)]
     if stage is not None
     for keys, words in settings(path)
 ]
 
 
-@pytest.mark.parametrize("stage, keys, words", CASES)
-def test_what_a_comment_names_is_accepted(stage, keys, words):
+@pytest.mark.parametrize("system, stage, keys, words", CASES)
+def test_what_a_comment_names_is_accepted(system, stage, keys, words):
     keys = keys[1:] if keys[0] == stage else keys  # a file of @package _global_
-    matching = [field for system in SYSTEMS if stage in system.modules for field in fields(system.stage(stage).Config, keys)]
+    matching = fields(system.stage(stage).Config, keys)
     assert matching, f"no field {'.'.join(keys)} in the config of {stage}"
     for word in words:
         assert any(accepted(field, word) for field in matching), f"{'.'.join(keys)}={word} is refused"
 
 
 def test_comments_with_alternatives_are_found():
-    assert {"variation", "backend", "split", "optimizer", "lpips"} <= {case.values[1][-1] for case in CASES}
+    assert {"variation", "backend", "split", "optimizer", "lpips"} <= {case.values[2][-1] for case in CASES}
     assert alternatives(" adamw | muon (2-D weights; AdamW for the rest)") == ["adamw", "muon"]
     assert alternatives(" none | vgg: LPIPS as well, a | b") == ["none", "vgg"] and not alternatives(" pixels")

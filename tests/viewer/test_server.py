@@ -272,7 +272,10 @@ def test_a_port_in_use_is_told_in_a_line(store, capsys):
 
 def test_ctrl_c_stops_it(store):
     words = [sys.executable, "-m", "stages.cli", "view", str(store[0]), "--port", "0", "--no-browser"]
-    process = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # a shell's background job ignores it
+    )  # fmt: skip
     try:
         address = process.stdout.readline().split()[0]
         with urllib.request.urlopen(f"{address}api/start") as answer:

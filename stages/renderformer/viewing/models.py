@@ -214,11 +214,12 @@ def numbers(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
 def predict(context: Context, arguments: Mapping[str, Any]) -> dict[str, Any]:
     """One view by a model: ``image`` (an Image), ``seconds``, and the limits of the training data that it is beyond."""
     model = renderer(context, arguments.get("checkpoint"))
-    scene, side = edited_scene(context, arguments), resolution(arguments)
+    scene = edited_scene(context, arguments)
+    size = scene.picture_size(0, resolution(arguments), model.model.config.resolution_multiple)
     began = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        image = model.render(scene, 0, (side, side))
+        image = model.render(scene, 0, size)
     seconds = time.perf_counter() - began
     keep(context, "predicted", arguments, image)
     notes = [str(warning.message) for warning in caught]
