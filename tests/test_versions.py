@@ -1,6 +1,6 @@
 """A stage's code may not change silently: bump its ``version``, or state here that its output is unchanged.
 
-After a change: ``python tests/test_versions.py`` rewrites versions.json; the commit's message says which it was.
+After a change: ``python -m tests.test_versions`` rewrites versions.json; the commit's message says which it was.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def current() -> dict[str, dict]:
 def test_version_belongs_to_the_code(system, name):
     known = json.loads(FILE.read_text())[system][name]
     assert current()[system][name] == known, (
-        f"the code behind {system}'s {name} changed: bump its version if its output did, then run python tests/test_versions.py"
+        f"the code behind {system}'s {name} changed: bump its version if its output did, then run python -m tests.test_versions"
     )
 
 
