@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from model.renderformer.config import ModelConfig
 from pipeline.errors import UserError
@@ -120,7 +121,10 @@ def test_runs_and_probes_on_one_page(store, factor, tmp_path):
     near, far = (evaluated(store, name, shard_of(store), factor, value) for name, value in (("near", 0.9), ("far", 0.5)))
     out = tmp_path / "page.html"
     written = write_report([f"close <by>={near.key}", far.key[:12], probe(store).key], store, out, gallery=3)
-    assert written == [out, tmp_path / "page.json", tmp_path / "page.md"]
+    assert written == [out, tmp_path / "page.json", tmp_path / "page.md", tmp_path / "page.png"]
+    target, ours, theirs = np.split(np.asarray(Image.open(written[3]), float), 3)  # of all nine views in a row
+    assert target.shape[1] == 9 * len(target)
+    assert 0 < np.abs(ours - target).mean() < np.abs(theirs - target).mean()
     page, numbers, table = out.read_text(), json.loads(written[1].read_text()), written[2].read_text()
     assert not re.search(r'(src|href)="(?!data:|#)', page)  # one file, nothing to fetch
     assert "close &lt;by&gt;" in page and "close <by>" not in page and "20 &lt;b&gt;" in page

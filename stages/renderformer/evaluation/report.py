@@ -78,19 +78,32 @@ def view_pictures(runs: Sequence[Images], name: str) -> tuple[list[Picture], lis
     return shared, [own(images["prediction"]) for images in runs], exposure
 
 
-def overview(images: Sequence[Images], enlarge: int) -> np.ndarray:
-    """One picture of many views, worst first: (2 H, n W, 3) uint8, targets above predictions, each pixel ``enlarge`` wide."""
+def common_scenes(runs: Sequence[Run]) -> list[list[Mapping[str, Any]]]:
+    """Of each run, its summaries of the scenes that all runs have in common."""
+    same = tables.same_scenes(runs) if len(runs) > 1 else {scene["id"] for run in runs for scene in run.summary["per_scene"]}
+    return [[scene for scene in run.summary["per_scene"] if scene["id"] in same] for run in runs]
+
+
+def overview(runs: Sequence[Run]) -> bytes | None:
+    """A PNG of many views, the first run's worst first: targets on top, then a row of predictions for each run.
+
+    None where they have no view in common.
+    """
     columns = []
-    for view in images:
-        exposure = exposure_for(view["target"])
-        columns.append(np.concatenate([to_picture(view[name], exposure) for name in ("target", "prediction")]))
-    return np.concatenate(columns, axis=1).repeat(enlarge, axis=0).repeat(enlarge, axis=1)
+    for _, scenes, views in worst_first(common_scenes(runs), OVERVIEW_VIEWS):
+        images = [run.images(scenes[0]["id"], views[0]["index"]) for run in runs]
+        exposure = exposure_for(images[0]["target"])
+        pictures = [images[0]["target"], *(image["prediction"] for image in images)]
+        columns.append(np.concatenate([to_picture(picture, exposure) for picture in pictures]))
+    if not columns:
+        return None
+    enlarge = max(1, OVERVIEW_VIEW_PIXELS // columns[0].shape[1])
+    return png(np.concatenate(columns, axis=1).repeat(enlarge, axis=0).repeat(enlarge, axis=1))
 
 
 def gallery(runs: Sequence[Run], limit: int) -> tuple[list[View], int]:
     """The gallery's views, worst first, and how many there are. Runs on different data show what they have in common."""
-    same = tables.same_scenes(runs) if len(runs) > 1 else {scene["id"] for run in runs for scene in run.summary["per_scene"]}
-    scenes = [[scene for scene in run.summary["per_scene"] if scene["id"] in same] for run in runs]
+    scenes = common_scenes(runs)
     rows = []
     for rank, run_scenes, views in worst_first(scenes, limit):
         scene, view = run_scenes[0], views[0]
@@ -287,9 +300,8 @@ def probe_values(probe: Probe) -> dict[str, Any]:
 def write_evaluation(folder: Path, run: Run, gallery: int) -> None:
     """Write what *evaluate* leaves of one run: report.html, metrics.json, metrics.md and overview.png."""
     (folder / "report.html").write_text(page([run], limit=gallery), encoding="utf-8")
-    worst = worst_first([run.summary["per_scene"]], OVERVIEW_VIEWS)
-    if worst:
-        views = [run.images(scene["id"], view["index"]) for _, (scene,), (view,) in worst]
-        (folder / "overview.png").write_bytes(png(overview(views, max(1, OVERVIEW_VIEW_PIXELS // len(views[0]["target"])))))
+    picture = overview([run])
+    if picture:
+        (folder / "overview.png").write_bytes(picture)
     (folder / "metrics.md").write_text(tables.markdown(run.summary), encoding="utf-8")
     (folder / "metrics.json").write_text(json.dumps(run.summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")

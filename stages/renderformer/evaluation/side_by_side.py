@@ -1,7 +1,8 @@
 """``lightmill report KEY ...``: several runs, and probes, on one page.
 
 Reads artifacts of stages *evaluate* and *probe*; writes ``OUT.html`` (one file that opens from disk), ``OUT.json`` (the same
-numbers) and ``OUT.md`` (tables to paste). One design choice: runs are compared view by view, so that they must have been
+numbers), ``OUT.md`` (tables to paste) and ``OUT.png`` (the runs' views under the targets).
+One design choice: runs are compared view by view, so that they must have been
 evaluated on the same scenes, which is told by the scenes' bytes; other runs are shown together only when asked.
 """
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 def write_report(
     words: Sequence[str], store: Store, out: Path, gallery: int = 24, different_data: bool = False, title: str | None = None
 ) -> list[Path]:
-    """Write the page, JSON and Markdown; returns their paths.
+    """Write the page, JSON, Markdown and, of runs, the picture; returns their paths.
 
     words: artifacts as ``Store.resolve`` takes them, or ``NAME=KEY`` with the name that the page shall use. gallery: at most so
     many views are shown. different_data: show runs together that were evaluated on different scenes.
@@ -33,23 +34,27 @@ def write_report(
     from stages.renderformer.evaluation import report, tables
 
     if out.suffix.lower() != ".html":
-        raise UserError(f"{out}: the page must end in .html; the JSON and the Markdown lie beside it")
+        raise UserError(f"{out}: the page must end in .html; the other files lie beside it")
     if not out.parent.is_dir():
         raise UserError(f"{out.parent} is not a folder: make it first")
-    beside = [out.with_suffix(suffix) for suffix in (".json", ".md")]
+    beside = [out.with_suffix(suffix) for suffix in (".json", ".md", ".png")]
     if not out.exists() and (existing := [path.name for path in beside if path.exists()]):
         raise UserError(f"{' and '.join(existing)} would be replaced, and there is no report {out.name}: give another name")
     runs, probes = load(words, store)
     if not different_data:
         check_same(runs)
     page = report.page(runs, probes, gallery, title)
+    numbers = json.dumps(tables.numbers(runs, probes), indent=1, allow_nan=False) + "\n"
     files = {
-        out: page,
-        out.with_suffix(".json"): json.dumps(tables.numbers(runs, probes), indent=1, allow_nan=False) + "\n",
-        out.with_suffix(".md"): tables.side_by_side(runs, probes),
+        out: page.encode(),
+        out.with_suffix(".json"): numbers.encode(),
+        out.with_suffix(".md"): tables.side_by_side(runs, probes).encode(),
     }
-    for path, text in files.items():
-        write_atomic(path, text.encode())
+    picture = report.overview(runs) if runs and gallery else None  # which alone reads the shards
+    if picture:
+        files[out.with_suffix(".png")] = picture
+    for path, data in files.items():
+        write_atomic(path, data)
     return list(files)
 
 
