@@ -75,9 +75,7 @@ class ImagesConfig(FolderConfig):
 
     name: Literal["images"] = "images"
     video_frames: int = Field(80, ge=3)  # a video is cut into so many, the sharpest of each stretch
-    sfm_side: int = Field(
-        1000, ge=100
-    )  # longest side of the pictures that features are looked for in; pictures stay as they are
+    sfm_side: int = Field(1000, ge=100)  # longest side of the pictures that features are looked for in; photos stay
 
 
 FOLDERS = NerfstudioConfig | ColmapConfig | PandasetConfig | BlendedMVSConfig | NerfSyntheticConfig | ImagesConfig

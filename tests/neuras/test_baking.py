@@ -12,6 +12,7 @@ from PIL import Image
 
 from model.neuras.baked import Baked
 from pipeline.errors import UserError
+from stages.graphics.browser import find_browser
 from stages.graphics.cameras import Camera
 from stages.neuras.baking import browser, drawing, shaders
 from stages.neuras.baking.site import PAGE, write_site
@@ -130,7 +131,7 @@ INFO = CaptureInfo("metre", 1.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 5.0, "none", 
     "settings, expand", [({}, "fp16"), ({}, "rgba8"), ({"quantized": False}, "rgba8"), ({"networks": False}, "fp16")]
 )
 def test_the_page_draws_what_torch_computes(tmp_path, settings, expand):
-    if browser.find_browser() is None:
+    if find_browser() is None:
         pytest.skip("no Chromium: install chromium")
     flat = scenes.atlas()
     baked = scenes.baked(flat, **settings)

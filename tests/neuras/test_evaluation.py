@@ -17,7 +17,8 @@ from pipeline.store import Store
 from stages import cli
 from stages.graphics import metrics
 from stages.graphics.arrays import unpack_json
-from stages.neuras.baking import browser, drawing
+from stages.graphics.browser import find_browser
+from stages.neuras.baking import drawing
 from stages.neuras.evaluation import distributions, drive, paths, report, scores, summary
 from stages.neuras.evaluation.renderers import as_bytes, opengl
 from stages.neuras.evaluation.warping import Source, Warping
@@ -356,7 +357,7 @@ def test_kernel_distance_equals_its_sums_and_has_no_bias():
 
 def test_the_page_is_compared_with_torch(run):
     needs_opengl()
-    if browser.find_browser() is None:
+    if find_browser() is None:
         pytest.skip("install chromium")
     artifacts, _ = run(evaluate={**QUICK, "video_frames": 0, "page_views": 2})
     rows = json.loads(artifacts["evaluate"].file("metrics.json").read_bytes())["page"]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stages.graphics.browser import find_browser
 from stages.neuras.baking import browser
 from stages.neuras.baking.site import write_site
 from stages.neuras.records import CaptureInfo, FrameRecord
@@ -22,7 +23,7 @@ RED = (230, 20, 20)  # of the photos: no colour of the scene
 
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory):
-    if browser.find_browser() is None:
+    if find_browser() is None:
         pytest.skip("no Chromium: install chromium")
     site, flat = tmp_path_factory.mktemp("site"), scenes.atlas()
     photo = io.BytesIO()

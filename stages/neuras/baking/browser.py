@@ -13,9 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.graphics import browser
-from stages.graphics.browser import Page, find_browser
 
-__all__ = ["Page", "find_browser", "opened", "pictures"]
 READY = "document.documentElement?.dataset.ready ?? ''"
 TIMES = """(() => {
   const { gl } = lightmill, times = [];
@@ -44,7 +42,7 @@ def pictures(site: Path, links: Sequence[str], timing: int = 0, wait_s: float = 
 
 
 @contextlib.contextmanager
-def opened(site: Path, link: str = "", size: tuple[int, int] = (1600, 1000), wait_s: float = 180.0) -> Iterator[Page]:
+def opened(site: Path, link: str = "", size: tuple[int, int] = (1600, 1000), wait_s: float = 180.0) -> Iterator[browser.Page]:
     """The site's page, loaded, in a window of ``size``. Raises as ``pictures`` does."""
     with _served(site) as address, browser.opened(f"{address}/index.html#{link}", size, wait_s) as page:
         if page.until(READY) == "failed":

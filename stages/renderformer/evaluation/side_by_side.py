@@ -2,8 +2,8 @@
 
 Reads artifacts of stages *evaluate* and *probe*; writes ``OUT.html`` (one file that opens from disk), ``OUT.json`` (the same
 numbers), ``OUT.md`` (tables to paste) and ``OUT.png`` (the runs' views under the targets).
-One design choice: runs are compared view by view, so that they must have been
-evaluated on the same scenes, which is told by the scenes' bytes; other runs are shown together only when asked.
+One design choice: runs are compared view by view, so that they must have been evaluated on the same scenes, which is told by
+the scenes' bytes; other runs are shown together only when asked.
 """
 
 from __future__ import annotations
