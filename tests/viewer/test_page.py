@@ -270,8 +270,8 @@ def test_a_capture_shows_the_photo_over_the_surface_by_a_slider(page, store):
     go(page, f"#/record/{store[2]['capture'].name}/frame-drive_1")
     page.until(f"{SPACE}.photo.complete && !{SPACE}.over.hidden")
     assert page.value(f"{SPACE}.photo.naturalWidth") == 32
-    assert page.value(f"{SPACE}.panes[0].viewport.counts.points") == 50
-    assert page.value(f"{SPACE}.panes[0].viewport.counts.surface") == 3 * len(stores.scenes.atlas().faces)
+    page.until(f"{SPACE}.panes[0].viewport.counts.points === 50")
+    page.until(f"{SPACE}.panes[0].viewport.counts.surface === {3 * len(stores.scenes.atlas().faces)}")
     assert slide(page, "#opacity", 0.5) != "100 %"
     assert 0.3 < float(page.value(f"{SPACE}.over.style.opacity")) < 0.7
 
