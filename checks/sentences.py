@@ -1,4 +1,4 @@
-"""Counts the words of each sentence in README.md and docs/*.md: plain pages have short sentences. Run by hand:
+"""Counts the words of each sentence in README.md and docs/: plain pages have short sentences. Run by hand:
 
     python checks/sentences.py [PAGE.md ...] [--long 35]
 
@@ -10,6 +10,7 @@ exits with 1 where the mean of a page is over MEAN.
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 from pathlib import Path
@@ -55,18 +56,18 @@ def words(sentence: str) -> int:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("pages", nargs="*", type=Path, metavar="PAGE.md", help="default: README.md and docs/*.md")
+    parser.add_argument("pages", nargs="*", type=Path, metavar="PAGE.md", help="default: README.md and all of docs")
     parser.add_argument("--long", type=int, metavar="N", help="also print sentences of so many words or more")
     args = parser.parse_args()
-    pages = args.pages or [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    pages = args.pages or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     failed = 0
-    print(f"{'page':<20} {'sentences':>9} {'mean':>5} {'longest':>7}")
+    print(f"{'page':<24} {'sentences':>9} {'mean':>5} {'longest':>7}")
     for page in pages:
         found = sentences(page.read_text(encoding="utf-8"))
         lengths = [words(sentence) for sentence in found] or [0]
         mean = sum(lengths) / len(lengths)
         failed += mean > MEAN
-        print(f"{page.name:<20} {len(found):>9} {mean:>5.1f} {max(lengths):>7}{'  over' if mean > MEAN else ''}")
+        print(f"{os.path.relpath(page):<24} {len(found):>9} {mean:>5.1f} {max(lengths):>7}{'  over' if mean > MEAN else ''}")
         for length, sentence in zip(lengths, found, strict=False):
             if args.long and length >= args.long:
                 print(f"    {length}: {sentence}")

@@ -880,7 +880,7 @@ def test_every_variants_settings_exist_and_are_the_defaults_but_for_what_it_says
 
 
 def test_every_reason_is_told_to_users():
-    page = (ROOT / "docs/captures.md").read_text()
+    page = (ROOT / "docs/neuras/captures.md").read_text()
     told = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (`.*?) \|", page, flags=re.MULTILINE))))
     assert told == set(Capture.reasons)
 

@@ -152,7 +152,7 @@ def json_in(root: Path, path: Path, kind: type) -> Any:
     try:
         value = json.loads(path.read_bytes())
     except FileNotFoundError:
-        raise UserError(f"there is no {str(path)!r}: the set must lie in its own layout (docs/captures.md)") from None
+        raise UserError(f"there is no {str(path)!r}: the set must lie in its own layout (docs/neuras/captures.md)") from None
     except (ValueError, RecursionError) as error:
         raise UserError(f"{str(path)!r} is not JSON: {error}") from None
     if not isinstance(value, kind):
