@@ -121,7 +121,9 @@ def parse(kind: Any, data: Any, where: str) -> Any:
                 lines.append(f"{path} is needed")
             else:
                 value = "" if isinstance(problem.get("input"), dict) else f"={problem.get('input')!r}"  # what names itself
-                lines.append(f"{path}{value}: {problem['msg'].removeprefix('Value error, ')}")
+                reason = problem["msg"].removeprefix("Value error, ")
+                jobs = "; for a job of each value add -m" if isinstance(problem.get("input"), list) else ""
+                lines.append(f"{path}{value}: {reason}{jobs}")
         raise UserError("; ".join(lines)) from None
 
 

@@ -15,6 +15,7 @@ from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ValueType
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
@@ -78,6 +79,13 @@ def parse_overrides(words: Sequence[str]) -> list[Any]:
     return overrides
 
 
+def _as_list(override: Any) -> str:
+    """The override's word, with values between commas in brackets. A group has no list: Hydra refuses those."""
+    name, equals, value = override.input_line.partition("=")
+    several = override.is_choice_sweep() and override.value_type is ValueType.SIMPLE_CHOICE_SWEEP and "." in name
+    return f"{name}{equals}[{value}]" if several else override.input_line
+
+
 def _syntax_error(word: str, error: HydraException) -> str:
     name, equals, _ = word.partition("=")
     if not equals and not name.startswith("~"):
@@ -92,8 +100,11 @@ def _syntax_error(word: str, error: HydraException) -> str:
 
 
 def compose(overrides: Sequence[str]) -> dict[str, Any]:
-    """The config for ``overrides``; a UserError names what does not fit and the nearest right key or choice."""
-    parse_overrides(overrides)
+    """The config for ``overrides``; a UserError names what does not fit and the nearest right key or choice.
+
+    Several values (``name=a,b``) are a list here. In a sweep they have become jobs of one value each before.
+    """
+    overrides = [_as_list(override) for override in parse_overrides(overrides)]
     system = system_of(overrides)
     with initialized(system) as more:
         try:
@@ -111,6 +122,8 @@ def _leaves(value: Any, path: str) -> list[str]:
 def _explain(message: str, overrides: Sequence[str], system: System, more: Sequence[str]) -> str:
     """What is wrong with the first override that does not fit; ``message`` is Hydra's own."""
     first = message.splitlines()[0]
+    if first.startswith("Ambiguous value"):
+        return f"{first}: several values are for a sweep, add -m"
     folders = [config_folder(system), CONF]
     try:
         groups = [word for word in overrides if "=" in word and "." not in word.partition("=")[0]]

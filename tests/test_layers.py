@@ -54,7 +54,8 @@ stages.graphics.geometry.records  stages.graphics.geometry.paths
 stages.graphics.geometry  stages.graphics.mitsuba  stages.graphics.statistics  stages.graphics.video  \
 stages.graphics.device  stages.graphics.denoising  stages.graphics.panels
 stages.graphics.metrics  stages.graphics.exr  stages.graphics.casting
-stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages.graphics.page  stages.graphics.browser
+stages.graphics.arrays  stages.graphics.tonemap  stages.graphics.cameras  stages.graphics.page  stages.graphics.browser  \
+stages.graphics.lpips_setting
 stages.graphics
 model.renderformer.training  model.neuras
 model.renderformer.checkpoint

@@ -136,14 +136,15 @@ METRICS: Mapping[str, Metric] = {
 LPIPS_NETWORKS = {"vgg": "LPIPS (VGG)", "alex": "LPIPS (AlexNet)"}
 
 
-def with_lpips(network: str, folder: str | None) -> dict[str, Metric]:
-    """`METRICS` and, unless ``network`` is "none", LPIPS with that network ("vgg" or "alex") on tone-mapped values.
+def with_lpips(networks: Iterable[str], folder: str | None) -> dict[str, Metric]:
+    """`METRICS`, and LPIPS with each of the networks ("vgg", "alex") on tone-mapped values.
 
     The weights are those in ``folder``; without them a UserError says where they can be had.
     """
-    if network == "none":
-        return dict(METRICS)
+    return METRICS | {metric.name: metric for network in networks for metric in [_measured_lpips(network, folder)]}
 
+
+def _measured_lpips(network: str, folder: str | None) -> Metric:
     import torch
 
     from model.lpips import LPIPS
@@ -158,8 +159,7 @@ def with_lpips(network: str, folder: str | None) -> dict[str, Metric]:
         with torch.no_grad():
             return float(lpips(*images))
 
-    metric = _lpips(network, measure)
-    return {**METRICS, metric.name: metric}
+    return _lpips(network, measure)
 
 
 def _lpips(network: str, measure: Callable[[np.ndarray, np.ndarray], float]) -> Metric:

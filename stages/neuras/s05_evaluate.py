@@ -16,6 +16,7 @@ from pydantic import Field
 from pipeline.config import StageConfig, added, report, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
+from stages.graphics.lpips_setting import NONE, LpipsSetting, lpips_networks
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,7 +32,7 @@ class EvaluateConfig(StageConfig):
     warping_views: int = Field(4, ge=1)  # nearest photos that warping takes for a view
     depth_tolerance: float = Field(0.05, gt=0)  # of the mesh, relative to the true depth
     exposure: Literal["none", "half"] = added("none", legacy="none")  # half: found on the left half, scored on the right
-    lpips: Literal["none", "vgg", "alex"] = "none"
+    lpips: LpipsSetting = NONE
     lpips_folder: str | None = runtime(None)  # where its weights lie; None: see model.weights
     inception: bool = report(False)  # FID and KID beside the drive
     inception_folder: str | None = runtime(None)  # where its weights lie
@@ -56,8 +57,8 @@ class Evaluate(MapStage):
         from model.inception import Inception
         from model.lpips import LPIPS
 
-        if config.lpips != "none":
-            LPIPS.files(config.lpips_folder, config.lpips)
+        for network in lpips_networks(config.lpips):
+            LPIPS.files(config.lpips_folder, network)
         if config.inception:
             Inception.file(config.inception_folder)
 
@@ -103,7 +104,7 @@ class Evaluate(MapStage):
             reference,
             {} if environment["opengl"] is None else {kind: scene.drawing(kind) for kind in ("fp16", "rgba8")},
             warping(capture, reference, scene.info.radius, config.warping_views),
-            scorers(config.lpips, config.lpips_folder),
+            scorers(lpips_networks(config.lpips), config.lpips_folder),
             config.depth_tolerance,
             config.exposure == "half",
         )
@@ -134,7 +135,7 @@ class Evaluate(MapStage):
         summary["device"] = costs.device_bytes(scene.baked, scene.atlas)
         summary["storage"] = costs.storage(site, scene.baked)
         timing: dict[str, Any] = {}
-        missing = report.without_weights(config.lpips, config.inception)
+        missing = report.without_weights(bool(lpips_networks(config.lpips)), config.inception)
         if drawn_by is None:
             missing.append(report.NO_OPENGL)
         elif config.timing_frames:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
+from stages.graphics.lpips_setting import NONE, lpips_networks, parse_lpips
 
 
 def command_trace(arguments: argparse.Namespace) -> int:
@@ -28,6 +29,13 @@ def command_trace(arguments: argparse.Namespace) -> int:
     for path in trace(arguments.scene, arguments.out, settings, arguments.view, room=room_of(arguments)):
         print(path)
     return 0
+
+
+def lpips_argument(text: str) -> str | tuple[str, ...]:
+    try:
+        return parse_lpips(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def room_of(arguments: argparse.Namespace) -> Any:
@@ -62,7 +70,7 @@ def command_compare(arguments: argparse.Namespace) -> int:
     from stages.renderformer.inference.settings import PredictSettings
 
     first, out = Path(arguments.a), arguments.out
-    metrics = with_lpips(arguments.lpips, arguments.lpips_folder)
+    metrics = with_lpips(lpips_networks(arguments.lpips), arguments.lpips_folder)
     if out is not None:
         check_picture(Path(out), [first, *([Path(arguments.b)] if arguments.b is not None else [])])
     if arguments.b is not None or first.suffix.lower() in IMAGES:
@@ -331,7 +339,8 @@ def add_commands(parsers: Any, program: str) -> None:
     sub.add_argument("b", nargs="?", metavar="B", help="test image of the same size")
     sub.add_argument("-o", "--out", help="picture: both images, their difference x5, HDR-FLIP (of a scene: SCENE-compare.png)")
     sub.add_argument("--json", action="store_true", help="print JSON")
-    sub.add_argument("--lpips", choices=("none", "vgg", "alex"), default="none", help="LPIPS as well, by that network")
+    sub.add_argument("--lpips", metavar="NETWORK", type=lpips_argument, default=NONE,
+                     help="LPIPS as well: vgg, alex, or vgg,alex")  # fmt: skip
     sub.add_argument("--lpips-folder", metavar="FOLDER", help="where its published weights lie")
     group = sub.add_argument_group("of a scene")
     group.add_argument("--resolution", type=resolution_argument, metavar="N",

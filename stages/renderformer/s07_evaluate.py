@@ -24,6 +24,7 @@ from pipeline.config import StageConfig, report, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.graphics.device import choose_device
+from stages.graphics.lpips_setting import NONE, LpipsSetting, lpips_networks
 from stages.renderformer.evaluation.runs import VERSION
 
 if TYPE_CHECKING:
@@ -42,8 +43,9 @@ class EvaluateConfig(StageConfig):
     split: Literal["test", "validation", "train"] = "test"
     baseline_views: int = Field(1024, ge=1)  # a mean of 1,024 is within 0.005 dB of the mean of all, in bounded memory
     gallery: int = report(24, ge=0)  # views shown in the report
-    lpips: Literal["none", "vgg", "alex"] = "none"
+    lpips: LpipsSetting = NONE
     lpips_folder: str | None = runtime(None)  # where its weights lie; which they are is known from the network's name
+    ceiling_views: int = report(16, ge=0)  # views rendered once more, for the ceilings of SSIM, FLIP and LPIPS, 0: none
     timing_scenes: int = report(5, ge=0)  # scenes on which the stages are timed, 0: none
     device: Literal["auto", "cpu", "cuda"] = runtime("auto")
 
@@ -68,10 +70,10 @@ class Evaluate(MapStage):
 
     def agree(self, config: EvaluateConfig, configs: Mapping[str, StageConfig]) -> None:
         """Weights that are missing are missed before anything runs."""
-        if config.lpips != "none":
-            from model.lpips import LPIPS
+        from model.lpips import LPIPS
 
-            LPIPS.files(config.lpips_folder, config.lpips)
+        for network in lpips_networks(config.lpips):
+            LPIPS.files(config.lpips_folder, network)
 
     def slug(self, config: EvaluateConfig) -> str:
         return config.split
@@ -162,19 +164,22 @@ class Evaluate(MapStage):
 
     def finish(self, config: EvaluateConfig, inputs: Inputs, draft: Draft) -> None:
         from stages.graphics.arrays import unpack_json
-        from stages.graphics.metrics import METRICS, named
+        from stages.graphics.metrics import METRICS, named, with_lpips
         from stages.graphics.statistics import summarise
-        from stages.renderformer.evaluation.ceiling import ceiling, noise_pairs
+        from stages.renderformer.evaluation.ceiling import ceiling, noise_pairs, render_ceilings
         from stages.renderformer.evaluation.regions import summarise_regions
         from stages.renderformer.evaluation.report import write_evaluation
         from stages.renderformer.evaluation.runs import run_of
 
         shard, train = inputs["shard"], inputs["train"]
         scenes = [unpack_json(draft.read(row.id, ("metrics.json",)).members["metrics.json"]) for row in draft.rows()]
-        metrics = named({*METRICS, f"lpips_{config.lpips}"})
+        metrics = named({*METRICS, *(f"lpips_{network}" for network in lpips_networks(config.lpips))})
         summary = summarise(scenes, metrics)
         summary["regions"] = summarise_regions(scenes)
         summary["ceiling"] = ceiling(scenes, config.split, *noise_pairs(shard, config.split))
+        summary["ceiling"] |= render_ceilings(
+            shard, config.split, config.ceiling_views, with_lpips(lpips_networks(config.lpips), config.lpips_folder)
+        )
         log = [json.loads(line) for line in train.file("log.jsonl").read_text().splitlines() if line]
         summary["train"] = {
             "key": train.key,
@@ -240,7 +245,7 @@ def open_worker(
         model=model,
         closed_form=model.without_learning(),
         shard=inputs["shard"],
-        metrics=with_lpips(config.lpips, config.lpips_folder),
+        metrics=with_lpips(lpips_networks(config.lpips), config.lpips_folder),
         mean_images=mean_images,
     )
 

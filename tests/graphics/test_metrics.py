@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import UserError
+from stages.graphics.lpips_setting import lpips_networks, parse_lpips
 from stages.graphics.metrics import (
     METRICS,
     PSNR_MAX,
@@ -69,7 +70,7 @@ def test_lpips_agrees_with_its_definition_on_tone_mapped_values(network, tmp_pat
 
     write_weights(tmp_path, network)
     reference, test = hdr_pair(7, (36, 40), 0.5)
-    metric = with_lpips(network, str(tmp_path))[f"lpips_{network}"]
+    metric = with_lpips([network], str(tmp_path))[f"lpips_{network}"]
     mapped = [np.clip(np.log2(1 + np.maximum(x.astype(np.float64), 0)), 0, 1).transpose(2, 0, 1) for x in (reference, test)]
     expected = distance(tmp_path, network, *mapped)
     assert expected > 0.01
@@ -185,11 +186,28 @@ def test_bad_pairs_are_refused_with_what_is_wrong(pair):
 
 
 def test_lpips_carries_its_net_and_asks_for_weights(tmp_path):
-    assert with_lpips("none", None) == METRICS
+    assert with_lpips([], None) == METRICS
     metrics = named({*METRICS, "lpips_alex"})
     assert list(metrics) == [*METRICS, "lpips_alex"] and metrics["lpips_alex"].heading == "LPIPS (AlexNet)\u00a0↓"
     with pytest.raises(UserError, match="alexnet.*evaluate.lpips=none"):  # at once, not after a path trace
-        with_lpips("alex", str(tmp_path))
+        with_lpips(["alex"], str(tmp_path))
+
+
+def test_the_setting_names_no_network_or_one_or_both(tmp_path):
+    from tests.model.lpips import write_weights
+
+    words = {"none": "none", "alex": "alex", "vgg,alex": ("vgg", "alex"), "alex,vgg": ("vgg", "alex"), "vgg,vgg": "vgg"}
+    assert {word: parse_lpips(word) for word in words} == words
+    assert parse_lpips(["alex", "vgg"]) == ("vgg", "alex") and parse_lpips(["vgg"]) == "vgg"
+    for wrong in ("", "vgg,none", "squeeze", [], None, 3):
+        with pytest.raises(ValueError, match="choose vgg, alex, both as vgg,alex, or none"):
+            parse_lpips(wrong)
+    for network in ("vgg", "alex"):
+        write_weights(tmp_path, network)
+    metrics = with_lpips(lpips_networks(("vgg", "alex")), str(tmp_path))
+    assert list(metrics) == [*METRICS, "lpips_vgg", "lpips_alex"]
+    image = np.random.default_rng(0).uniform(0, 2, (64, 64, 3)).astype(np.float32)
+    assert measure_all(image, image[::-1].copy(), metrics).keys() == metrics.keys()
 
 
 def test_tone_maps_invert():

@@ -102,6 +102,15 @@ def test_wrong_values_are_named_as_they_are_written(overrides, message):
         parse(SYSTEM.stage("train").Config, compose(overrides)["train"], "train")
 
 
+def test_several_values_without_a_sweep_are_a_list():
+    root = compose(["evaluate.lpips=vgg,alex", "decimate.budgets=64,128"])
+    assert root["evaluate"]["lpips"] == ["vgg", "alex"] and root["decimate"]["budgets"] == [64, 128]
+    with pytest.raises(UserError, match=r"^render\.max_spp=\[1, 2\]: .*for a job of each value add -m"):
+        parse(SYSTEM.stage("render").Config, compose(["render.max_spp=1,2"])["render"], "render")
+    with pytest.raises(UserError, match="model=tiny,base.*add -m"):
+        compose(["model=tiny,base"])
+
+
 @pytest.mark.parametrize("flags", [["-m"], []])
 def test_command_line_accepts_the_sweep_flag_anywhere(tmp_path, flags):
     words = ["stage=train", "plan=true", "model=tiny,small" if flags else "model=tiny", f"store={tmp_path}", *flags]

@@ -38,7 +38,7 @@ from stages.renderformer.evaluation.ceiling import ceiling, noise_pairs
 from stages.renderformer.evaluation.plots import loss_curves
 from stages.renderformer.evaluation.regions import REGIONS, region_errors, region_map, summarise_regions
 from stages.renderformer.evaluation.runs import facts
-from stages.renderformer.evaluation.tables import markdown
+from stages.renderformer.evaluation.tables import ceiling_lines, markdown
 from stages.renderformer.records import SceneRecord, ViewRecord
 from stages.renderformer.s07_evaluate import Evaluate, EvaluateConfig, training_images, visible_roughness
 from stages.renderformer.views import encode_view
@@ -222,6 +222,36 @@ class TestCeiling:
         ceilings = ceiling(scenes, "test", pairs, "test")
         assert ceilings["log_error"]["mean"] == pytest.approx(np.mean([row["log_error"] for row in real]), rel=0.02)
         assert ceiling(scenes, "test", [], "test") == {}
+
+    def test_a_second_render_bounds_what_no_formula_tells(self, inputs, monkeypatch):
+        """The truth of a noisy target scores better than a second noisy image, in each metric but the one with a formula."""
+        from stages.renderformer.dataset import decode_sample
+        from stages.renderformer.evaluation import ceiling as module
+
+        params = {"seed": 3, "resolution": SIZE, "max_spp": 5, "denoise": False, "noise_share": 0.5}
+        monkeypatch.setattr(module, "history", lambda inputs: {"render": {"params": params}})
+        monkeypatch.setattr(module.backends, "choose", lambda: {"backend": "fake"})
+        rng, asked = np.random.default_rng(1), []
+
+        def render_again(scene, settings, backend, views):
+            asked.append((scene.id, settings, views))
+            image = decode_sample(inputs["shard"].read(scene.id)).views[views[0]].image
+            return [SimpleNamespace(image=(image + rng.normal(0, 0.02, image.shape)).astype(np.float32))]
+
+        monkeypatch.setattr(module, "render_views", render_again)
+        ceilings = module.render_ceilings(inputs["shard"], "test", 2, METRICS)
+        assert [(id, views) for id, _, views in asked] == [("test-0", [0]), ("test-2", [0])]
+        seeds = {settings.seed for _, settings, _ in asked}
+        assert len(seeds) == 2 and {(s.max_spp, s.resolution, s.denoise) for _, s, _ in asked} == {(5, SIZE, False)}
+        assert set(ceilings) == set(METRICS) - {"psnr", "log_error"}  # which the data tells
+        assert 0.3 < ceilings["ssim"]["mean"] < 1 and 0 < ceilings["flip"]["mean"] < 0.5
+        assert {ceiling["from"] for name, ceiling in ceilings.items() if name != "psnr_tm"} == {"second renders"}
+        assert ceilings["ssim"]["views"] == 2 and ceilings["ssim"]["of"] == "test" and ceilings["ssim"]["low"] is None
+        lines = ceiling_lines({"ceiling": ceilings})
+        assert len(lines) == 2 and "would score" in lines[0] and lines[1].startswith("SSIM; SSIM, tone-mapped; HDR-FLIP: ")
+        assert module.render_ceilings(inputs["shard"], "test", 0, METRICS) == {}
+        monkeypatch.setattr(module, "history", lambda inputs: {})
+        assert module.render_ceilings(inputs["shard"], "test", 2, METRICS) == {}
 
     def test_pairs_are_looked_for_in_all_splits_where_the_evaluated_one_has_few(self, inputs):
         pairs, where = noise_pairs(inputs["shard"], "test")

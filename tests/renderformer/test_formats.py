@@ -150,13 +150,156 @@ def test_collada_is_read_with_its_transforms(tmp_path):
     assert np.ptp(read(tmp_path / "box.dae").vertices, axis=0) == pytest.approx([2, 1.2, 0.8])
 
 
-def test_3mf_is_read(tmp_path):
-    pytest.importorskip("lxml", reason="lxml is not installed")
-    (tmp_path / "box.3mf").write_bytes(trimesh.Scene([trimesh.creation.box(BOX)]).export(file_type="3mf"))
-    assert np.ptp(read(tmp_path / "box.3mf").vertices, axis=0) == pytest.approx(BOX)
+@pytest.mark.parametrize(
+    ("change", "sides", "area"),
+    [
+        (("Y_UP", "Z_UP"), [2, 0.8, 1.2], 2 * (2 * 0.8 + 2 * 1.2 + 0.8 * 1.2)),  # turned: y is up
+        (("<scale>2 2 2</scale>", "<scale>-2 2 2</scale>"), [2, 1.2, 0.8], 2 * (2 * 0.8 + 2 * 1.2 + 0.8 * 1.2)),
+        (('<triangles count="12">', '<polylist count="3">', "</p></triangles>", "</p></polylist>", "</vertices>", "</vertices>",
+          'offset="0"/><p>{faces}', 'offset="0"/><vcount>3 3 3</vcount><p>0 1 2 3 4 5 6 7 0'), None, None),
+    ],
+)  # fmt: skip
+def test_collada_axes_mirrors_and_polygons(tmp_path, change, sides, area):
+    pytest.importorskip("collada", reason="pycollada is not installed")
+    box, text = trimesh.creation.box(BOX), DAE
+    for old, new in zip(change[::2], change[1::2], strict=True):
+        assert old in text
+        text = text.replace(old, new)
+    points, faces = (" ".join(map(str, values.ravel())) for values in (box.vertices, box.faces))
+    (tmp_path / "box.dae").write_text(text.format(points=points, faces=faces))
+    mesh = read(tmp_path / "box.dae")
+    if sides is None:
+        assert len(mesh.faces) == 3
+        return
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx(sides)
+    found = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    assert found.area == pytest.approx(area) and found.volume > 0
 
 
-@pytest.mark.parametrize(("suffix", "package"), [(".usdc", "usd-core"), (".3mf", "lxml"), (".dae", "pycollada")])
+def test_what_a_collada_skin_moves_is_drawn_at_rest_and_said(tmp_path):
+    pytest.importorskip("collada", reason="pycollada is not installed")
+    box = trimesh.creation.box(BOX)
+    points, faces = (" ".join(map(str, values.ravel())) for values in (box.vertices, box.faces))
+    array = '<source id="{0}"><{1} id="{0}a" count="{2}">{3}</{1}><technique_common><accessor source="#{0}a" count="1" {4}>'
+    array += '<param name="{5}" type="{6}"/></accessor></technique_common></source>'
+    unit = " ".join(map(str, np.eye(4).ravel()))
+    skin = f"""<library_controllers><controller id="c"><skin source="#g"><bind_shape_matrix>{unit.replace("1.0", "3.0", 1)}
+</bind_shape_matrix>{array.format("j", "Name_array", 1, "J", "", "JOINT", "Name")}
+{array.format("b", "float_array", 16, unit, 'stride="16"', "TRANSFORM", "float4x4")}
+{array.format("w", "float_array", 1, "1", "", "WEIGHT", "float")}
+<joints><input semantic="JOINT" source="#j"/><input semantic="INV_BIND_MATRIX" source="#b"/></joints>
+<vertex_weights count="8"><input semantic="JOINT" source="#j" offset="0"/><input semantic="WEIGHT" source="#w" offset="1"/>
+<vcount>{"1 " * 8}</vcount><v>{"0 0 " * 8}</v></vertex_weights></skin></controller></library_controllers>"""
+    text = DAE.replace("<library_visual_scenes>", skin.replace("{", "{{").replace("}", "}}") + "<library_visual_scenes>")
+    text = text.replace('<instance_geometry url="#g"/>', '<instance_controller url="#c"/>')
+    (tmp_path / "box.dae").write_text(text.format(points=points, faces=faces))
+    mesh = read(tmp_path / "box.dae", textures=True)
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx([3, 0.6, 0.4])
+    assert any("moved by a skeleton" in note for note in mesh.notes)
+
+
+def usd_mesh(stage, path: str, points, counts, index):
+    from pxr import Gf, UsdGeom
+
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreatePointsAttr([Gf.Vec3f(*map(float, point)) for point in points])
+    mesh.CreateFaceVertexCountsAttr(counts)
+    mesh.CreateFaceVertexIndicesAttr(index)
+    return mesh
+
+
+def usd_stage(path: Path):
+    from pxr import Usd
+
+    return Usd.Stage.CreateNew(str(path))
+
+
+def saved(stage, **options) -> load.Loaded:
+    stage.GetRootLayer().Save()
+    return read(Path(stage.GetRootLayer().realPath), **options)
+
+
+def test_usd_instancers_place_their_copies(pxr, tmp_path):
+    from pxr import Gf, UsdGeom
+
+    stage = usd_stage(tmp_path / "many.usda")
+    instancer = UsdGeom.PointInstancer.Define(stage, "/many")
+    instancer.AddScaleOp().Set((1, 1, 3))
+    inner = UsdGeom.Xform.Define(stage, "/many/proto")
+    inner.AddTranslateOp().Set((0, 0, 1))
+    usd_mesh(stage, "/many/proto/square", [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [4], [0, 1, 2, 3])
+    instancer.CreatePrototypesRel().AddTarget("/many/proto")
+    instancer.CreateProtoIndicesAttr([0, 0, 0])
+    instancer.CreatePositionsAttr([Gf.Vec3f(0, 0, 0), Gf.Vec3f(5, 0, 0), Gf.Vec3f(0, 7, 0)])
+    instancer.CreateScalesAttr([Gf.Vec3f(1, 1, 1), Gf.Vec3f(2, 1, 1), Gf.Vec3f(1, 1, 2)])
+    mesh = saved(stage)
+    assert len(mesh.faces) == 6  # the prototype itself is not drawn
+    assert mesh.vertices.min(axis=0) == pytest.approx([0, 0, 3]) and mesh.vertices.max(axis=0) == pytest.approx([7, 8, 6])
+    instancer.CreateInvisibleIdsAttr([1])
+    assert len(saved(stage).faces) == 4
+    instancer.CreateProtoIndicesAttr([0, 0, 1])
+    with pytest.raises(Reject, match="/many: prototype 1 of 1"):
+        saved(stage)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "sides", "volume"),
+    [
+        ("Cube", {"size": 2.0}, [2, 2, 2], 8),
+        ("Sphere", {"radius": 0.5}, [1, 1, 1], np.pi / 6),
+        ("Cylinder", {"radius": 1.0, "height": 3.0, "axis": "X"}, [3, 2, 2], 3 * np.pi),
+        ("Cone", {"radius": 1.0, "height": 3.0, "axis": "Y"}, [2, 3, 2], np.pi),
+        ("Capsule", {"radius": 1.0, "height": 3.0}, [2, 2, 5], 3 * np.pi + 4 / 3 * np.pi),
+        ("Plane", {"width": 3.0, "length": 1.0, "axis": "X"}, [0, 1, 3], 0),
+    ],
+)
+def test_usd_shapes_by_formula(pxr, tmp_path, kind, fields, sides, volume):
+    from pxr import UsdGeom
+
+    stage = usd_stage(tmp_path / "shape.usda")
+    prim = getattr(UsdGeom, kind).Define(stage, "/shape").GetPrim()
+    for name, value in fields.items():
+        prim.GetAttribute(name).Set(value)
+    mesh = saved(stage, textures=True)
+    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx(sides, rel=0.01) and middle == pytest.approx([0, 0, 0], abs=1e-6)
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume == pytest.approx(volume, rel=0.02, abs=1e-9)
+    assert mesh.notes == [f"/shape: a {kind.lower()}, as {len(mesh.faces):,} triangles"]
+
+
+def test_usd_polygons_with_inward_corners_and_holes(pxr, tmp_path):
+    stage = usd_stage(tmp_path / "flat.usda")
+    points = [(0, 0, 0), (4, 0, 0), (4, 4, 0), (2, 1, 0), (0, 4, 0), (9, 0, 0), (9, 1, 0), (8, 0, 0)]
+    mesh = usd_mesh(stage, "/m", points, [5, 3], [0, 1, 2, 3, 4, 5, 6, 7])
+    mesh.CreateHoleIndicesAttr([1])
+    found = saved(stage)
+    assert trimesh.Trimesh(found.vertices, found.faces).area == pytest.approx(10) and len(found.faces) == 3
+
+
+def test_what_of_a_usd_is_not_drawn_is_said(pxr, tmp_path):
+    from pxr import UsdGeom, UsdShade
+
+    stage = opened(usd_box(tmp_path / "more.usda"))
+    UsdGeom.BasisCurves.Define(stage, "/hair")
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/root/Box/Mesh"))
+    UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("skel:jointIndices", _types().IntArray).Set([0] * 8)
+    material = UsdShade.Material.Define(stage, "/root/Other")
+    shader = UsdShade.Shader.Define(stage, "/root/Other/Shader")
+    shader.CreateIdAttr("ND_standard_surface_surfaceshader")
+    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    notes = saved(stage, textures=True).notes
+    for words in ("/hair: BasisCurves is left out", "is moved by a skeleton", "'Other': it has no UsdPreviewSurface"):
+        assert any(words in note for note in notes), notes
+
+
+def opened(path: Path):
+    from pxr import Usd
+
+    return Usd.Stage.Open(str(path))
+
+
+@pytest.mark.parametrize(("suffix", "package"), [(".usdc", "usd-core"), (".dae", "pycollada")])
 def test_a_missing_package_is_named(tmp_path, monkeypatch, suffix, package):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)

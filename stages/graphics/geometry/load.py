@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.errors import Reject
 from stages.graphics.geometry import colours
-from stages.graphics.geometry.formats import by_trimesh, gltf_mesh, obj, off, ply, stl, usd
+from stages.graphics.geometry.formats import dae, gltf_mesh, obj, off, ply, stl, threemf, usd
 from stages.graphics.geometry.formats.faults import at
 from stages.graphics.geometry.formats.parts import Part, Source
 from stages.graphics.geometry.measure import normal_vectors
@@ -31,8 +31,8 @@ READERS: dict[str, Callable[[bytes, Source], list[Part]]] = {
     ".ply": ply.read,
     ".stl": stl.read,
 }
-PLAIN = tuple(READERS)  # read without optional packages
-READERS |= dict.fromkeys(by_trimesh.PACKAGES, by_trimesh.read) | dict.fromkeys(usd.SUFFIXES, usd.read)
+PLAIN = tuple(READERS)  # of these a scene file may name some
+READERS |= {".3mf": threemf.read, ".dae": dae.read} | dict.fromkeys(usd.SUFFIXES, usd.read)
 SUFFIXES = tuple(READERS)  # what is looked for in a folder
 # What is not read, and the export to choose in the program that wrote it.
 EXPORTS = {

@@ -66,11 +66,11 @@ class About:
         }
 
 
-def without_weights(lpips: str, inception: bool) -> list[str]:
+def without_weights(lpips: bool, inception: bool) -> list[str]:
     """What these settings leave out because it needs published weights, and what would give it."""
     missing = []
-    if lpips == "none":
-        missing.append("LPIPS: `lightmill weights lpips` fetches its networks, then run with `evaluate.lpips=vgg`, or alex.")
+    if not lpips:
+        missing.append("LPIPS: `lightmill weights lpips` fetches its networks, then run with `evaluate.lpips=vgg,alex`.")
     if not inception:
         missing.append(
             "FID and KID beside the drive: `lightmill weights inception` fetches their network, then run with "

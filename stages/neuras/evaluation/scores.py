@@ -32,17 +32,17 @@ def told(names: Iterable[str]) -> dict[str, Metric]:
     return {name: metric for name, metric in {"mse": mse, **named(wanted)}.items() if name in wanted}
 
 
-def scorers(lpips: str, folder: str | None) -> dict[str, Scorer]:
-    """MSE, PSNR and SSIM, and LPIPS by the network ``lpips`` unless that is "none".
+def scorers(lpips: Iterable[str], folder: str | None) -> dict[str, Scorer]:
+    """MSE, PSNR and SSIM, and LPIPS by each of the networks ``lpips``.
 
-    Raises UserError where the network's weights are missing.
+    Raises UserError where the weights of one are missing.
     """
     known: dict[str, Scorer] = {
         "mse": lambda photo, picture, counts: float(np.mean((photo[counts] - picture[counts]) ** 2)),
         "psnr": lambda photo, picture, counts: psnr(photo[counts], picture[counts]),
         "ssim": ssim,
     }
-    return known if lpips == "none" else {**known, f"lpips_{lpips}": _lpips(lpips, folder)}
+    return known | {f"lpips_{network}": _lpips(network, folder) for network in lpips}
 
 
 def _lpips(network: str, folder: str | None) -> Scorer:

@@ -10,22 +10,35 @@ is charged for it. Two things are known of that error, both noted by *render* in
 - Every view has an estimate of its mean absolute error of log10(1 + x), the denoiser's bias included
   (``stages.renderformer.rendering.error``). Its mean over the evaluated views is the least log error that can be expected.
 
-Other metrics have none: no formula leads from a pair's score to that of the truth.
+For SSIM, FLIP and LPIPS no formula leads from a pair's score to that of the truth. So some of the evaluated views are
+rendered once more, with the settings of *render* and random numbers of their own, and the second image is scored against the
+target. The truth would score better than that, as it has no noise of its own. Tone-mapped PSNR has the formula of PSNR.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-from stages.graphics.metrics import METRICS
+import numpy as np
+
+from pipeline.keys import seed_for
+from pipeline.store import history
+from stages.graphics.metrics import METRICS, PSNR_MAX, Metric, measure_all
+from stages.graphics.mitsuba import backend as backends
 from stages.graphics.statistics import Scene, bootstrap
+from stages.renderformer.dataset import decode_sample
+from stages.renderformer.rendering.render import render_views
+from stages.renderformer.rendering.settings import RenderSettings
 
 if TYPE_CHECKING:
     from pipeline.store import Artifact
 
 ENOUGH = 20  # pairs of the evaluated split; where it has fewer, all splits are asked: their noise has the same law
 MOST = 20000  # scenes whose meta is read for them
+TOLD_BY_DATA = ("psnr", "log_error")  # metrics whose ceiling the data's own figures tell
+HALVED_DB = 10 * np.log10(2)  # the truth has half the squared error against an image that a second one has
 
 
 def view_noise(meta: Mapping[str, Any], camera: int) -> dict[str, Any]:
@@ -72,4 +85,33 @@ def ceiling(scenes: Sequence[Scene], split: str, pairs: Sequence[Sequence[Mappin
         add("log_error", estimates, split, "estimates")
     else:
         add("log_error", [[pair["log_error"] for pair in scene] for scene in pairs], where, "pairs")
+    return ceilings
+
+
+def render_ceilings(shard: Artifact, split: str, count: int, metrics: Mapping[str, Metric]) -> dict[str, Any]:
+    """Ceilings, as `ceiling` gives them, of the metrics that are not told by the data: from ``count`` views rendered again.
+
+    At most a view of each scene. Nothing where the shards do not come from *render*.
+    """
+    rendered = history({"shard": shard}).get("render")
+    if rendered is None or not count:
+        return {}
+    params = rendered["params"]
+    given = {field.name: params[field.name] for field in fields(RenderSettings) if field.name in params}
+    backend, ids = backends.choose(), shard.ids(split)
+    scores = []
+    for place in np.unique(np.linspace(0, len(ids) - 1, min(count, len(ids))).round().astype(int)):
+        sample = decode_sample(shard.read(ids[place]))
+        camera, view = next(iter(sample.views.items()))
+        settings = RenderSettings(**given | {"seed": seed_for(params["seed"], "evaluate/ceiling", ids[place])})
+        again = render_views(sample.scene, settings, backend, [camera])[0]
+        scores.append(measure_all(view.image, again.image, metrics))
+    ceilings = {}
+    for name, metric in metrics.items():
+        if name in TOLD_BY_DATA:
+            continue
+        values = [[min(row[name] + HALVED_DB, PSNR_MAX) if name == "psnr_tm" else row[name]] for row in scores]
+        source = "pairs" if name == "psnr_tm" else "second renders"
+        counts = {"views": len(scores), "scenes": len(scores)}
+        ceilings[name] = {**bootstrap(values, metric.bounds), **counts, "of": split, "from": source}
     return ceilings

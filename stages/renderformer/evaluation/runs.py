@@ -16,7 +16,7 @@ from pipeline.store import history, store_of
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Draft
 
-VERSION = 4  # of stage evaluate: what the artifacts that are read here hold
+VERSION = 5  # of stage evaluate: what the artifacts that are read here hold
 PROBE_FIELDS = ("name", "title", "question", "setting", "model", "columns", "rows", "notes")  # of probe.json
 CONFIGS = ("collect", "scene", "render", "train", "evaluate")  # stages whose settings the page shows
 

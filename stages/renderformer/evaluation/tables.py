@@ -13,6 +13,7 @@ from stages.renderformer.evaluation.regions import REGIONS
 from stages.renderformer.evaluation.runs import Probe, Run
 
 CEILING = "ceiling: noise of the ground truth"
+CEILING_SOURCES = {"pairs": "rendered twice", "estimates": "by the renderer's own estimate"}
 
 
 def format_estimate(metric: Metric, value: Estimate, sign: str = "") -> tuple[str, str]:
@@ -43,14 +44,20 @@ def verdicts(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def ceiling_lines(summary: Mapping[str, Any]) -> list[str]:
-    """What the noise of the ground truth means for the scores, one sentence per metric that has a ceiling."""
-    lines = []
-    for name, ceiling in summary["ceiling"].items():
-        metric, (mean, interval) = METRICS[name], format_estimate(METRICS[name], ceiling)
+    """What the noise of the ground truth means for the scores, a sentence for each metric whose ceiling is an estimate."""
+    lines, bounded = [], {}
+    for name, metric in named(summary["ceiling"]).items():
+        ceiling = summary["ceiling"][name]
+        of = f"{ceiling['views']} views of {ceiling['of']}"
+        if ceiling["from"] not in CEILING_SOURCES:
+            bounded.setdefault(of, []).append(metric.label)
+            continue
+        mean, interval = format_estimate(metric, ceiling)
         text = f"{metric.label}: the noiseless truth would score " + f"{mean} {metric.unit}".rstrip()
-        source = {"pairs": "rendered twice", "estimates": "by the renderer's own estimate"}[ceiling["from"]]
-        text += f" (95 % interval {interval}; {ceiling['views']} views of {ceiling['of']}, {source})"
-        lines.append(text + ".")
+        lines.append(f"{text} (95 % interval {interval}; {of}, {CEILING_SOURCES[ceiling['from']]}).")
+    for of, labels in bounded.items():
+        what = "the score of a second render with noise of its own, which the truth would beat"
+        lines.append(f"{'; '.join(labels)}: {what} ({of}).")
     return lines or ["No view of the data was rendered twice and none has an error estimate: the ceiling is unknown."]
 
 

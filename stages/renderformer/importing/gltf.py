@@ -15,10 +15,11 @@ import numpy as np
 from pipeline.errors import Reject, UserError
 from stages.graphics.geometry.colours import Images, as_colour
 from stages.graphics.geometry.formats.faults import at
-from stages.graphics.geometry.formats.gltf import Gltf, primitives_of, split_glb
+from stages.graphics.geometry.formats.gltf import Gltf, Primitive, primitives_of, split_glb
 from stages.graphics.geometry.formats.gltf_materials import OLDER, one_of, optional, textured, vertex_colours
+from stages.graphics.geometry.formats.gltf_pose import Placed, Poses
 from stages.graphics.geometry.formats.json_values import MISSING, floats, integer, items, parse, table
-from stages.graphics.geometry.formats.parts import Source, checked_part
+from stages.graphics.geometry.formats.parts import Source
 from stages.renderformer.importing.described import (
     LUMENS_PER_WATT,
     MAX_BYTES,
@@ -73,7 +74,7 @@ def read_gltf(path: Path) -> Described:
 
 class _Reader:
     def __init__(self, gltf: Gltf, source: Source):
-        self.gltf, self.tree, self.source = gltf, gltf.tree, source
+        self.gltf, self.tree, self.source, self.poses = gltf, gltf.tree, source, Poses(gltf, source, normals=True)
         self.notes: list[str] = []
         self.surfaces: dict[int | None, Surface] = {}
 
@@ -86,17 +87,18 @@ class _Reader:
             name = f"{name}.{index}" if name in taken else name
             taken.add(name)
             with at(f"node {index}"):
-                self._add(described, name, node, to_world)
+                self._add(described, name, index, to_world)
         if self.tree.get("animations"):
             self.notes.append("the file is animated: it is drawn as its nodes stand without animation")
         self.notes += self.source.notes
         return described
 
-    def _add(self, described: Described, name: str, node: dict[str, Any], to_world: np.ndarray) -> None:
+    def _add(self, described: Described, name: str, index: int, to_world: np.ndarray) -> None:
         """What a node carries."""
+        node = self.gltf.entry("nodes", index)
         extensions = optional(node, "extensions")
         if "mesh" in node:
-            described.parts += self.parts(name, integer(node, "mesh"), to_world)
+            described.parts += self.parts(name, integer(node, "mesh"), index, to_world)
         if "camera" in node:
             described.viewpoints.append(self.viewpoint(name, one_of(self.gltf, "cameras", integer(node, "camera")), to_world))
         if PUNCTUAL in extensions:
@@ -105,36 +107,31 @@ class _Reader:
             if number >= len(lights):
                 raise Reject("unreadable", f"light {number} does not exist, the file has {len(lights)}")
             described.lamps.append(self.lamp(name, lights[number], to_world))
-        if "skin" in node:
-            self.notes.append(f"{name!r} is moved by a skeleton: it is drawn in its rest pose")
-        if "EXT_mesh_gpu_instancing" in extensions:
-            self.notes.append(f"{name!r} has instances (EXT_mesh_gpu_instancing): one of them is drawn")
 
-    def parts(self, name: str, mesh: int, to_world: np.ndarray) -> Iterator[Part]:
-        linear = to_world[:3, :3]
+    def parts(self, name: str, mesh: int, index: int, to_world: np.ndarray) -> Iterator[Part]:
+        """The triangles of a node's mesh, in each of its places."""
         stated = primitives_of(self.gltf.entry("meshes", mesh))
         primitives = self.gltf.primitives(mesh)
         if len(primitives) < len(stated):
             self.notes.append(f"{name!r} has points or lines: they are left out")
-        if any(entry.get("targets") for entry in stated):
-            self.notes.append(f"{name!r} has shape keys: it is drawn without them")
-        for primitive in primitives:
-            checked = checked_part(primitive.points, primitive.triangles, primitive.vertex_place, primitive.triangle_place)
-            faces = checked.triangles
-            if np.linalg.det(linear) < 0:  # a mirrored node turns its faces inside out
-                faces = faces[:, ::-1]
-            if not len(faces):
-                continue
-            part = Part(name, (checked.points @ linear.T + to_world[:3, 3])[faces], self.surface(primitive.material))
+        for primitive, placed in self._placed(index, to_world, primitives):
+            faces = placed.part.triangles
+            part = Part(name, placed.part.points[faces], self.surface(primitive.material))
             with at(primitive.place):
-                if primitive.has("NORMAL"):
-                    part.normals = (primitive.attribute("NORMAL", 3) @ np.linalg.pinv(linear))[faces]
+                if (normals := placed.directions) is not None:
+                    part.normals = normals[faces]
                 for number in {texture.coordinates for texture in part.surface.textures.values()}:
                     if primitive.has(f"TEXCOORD_{number}"):
                         part.uv[number] = primitive.attribute(f"TEXCOORD_{number}", 2)[faces]
                 if primitive.has("COLOR_0"):
                     part.tint = vertex_colours(primitive, self.source)[faces]
             yield part
+
+    def _placed(self, index: int, to_world: np.ndarray, primitives: list[Primitive]) -> Iterator[tuple[Primitive, Placed]]:
+        for primitive in primitives:
+            if len(primitive.triangles):
+                for placed in self.poses.placed(index, to_world, primitive):
+                    yield primitive, placed
 
     def surface(self, number: int | None) -> Surface:
         if number not in self.surfaces:

@@ -77,8 +77,6 @@ def read_usd(path: Path) -> Described:
             LIGHTS[prim.GetTypeName()](_Light(name, prim, time, matrix), described)
         elif str(prim.GetTypeName()).startswith("DomeLight"):
             notes.append(f"light {name!r} is a sky: it is left out, since the scene's surroundings are black")
-    if any(str(prim.GetTypeName()) == "PointInstancer" for prim in stage.Traverse()):
-        notes.append("point instancers are left out")
     notes += images.notes
     return described
 

@@ -26,7 +26,7 @@ from stages.renderformer.scenes.laws import LARGEST_TRIANGLE, TEMPLATES, Camera,
 MAX_BYTES, MAX_FACES = 1 << 28, 2_000_000  # of a mesh file, as *collect* has them
 LEAST_FACES = 128  # an object should get; a room with fewer walls is taken before
 UP = {"x": (0, 90, 0), "-x": (0, -90, 0), "y": (90, 0, 0), "-y": (-90, 0, 0), "z": (0, 0, 0), "-z": (180, 0, 0)}
-Z_UP = (".stl",)  # made for printing; the other formats mostly have y up, as glTF prescribes
+Z_UP = (".stl", ".3mf")  # made for printing; the other formats mostly have y up, as glTF prescribes
 
 
 # Scene units. The object's bounding sphere stands on the floor in the middle.

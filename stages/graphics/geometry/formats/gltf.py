@@ -15,19 +15,26 @@ import numpy as np
 from pipeline.errors import Reject
 from stages.graphics.geometry.formats import draco
 from stages.graphics.geometry.formats.faults import at
-from stages.graphics.geometry.formats.json_values import data_of, floats, integer, integers, parse, table
+from stages.graphics.geometry.formats.json_values import data_of, floats, integer, integers, items, parse, table
 from stages.graphics.geometry.formats.parts import Source
 from stages.graphics.geometry.paths import check_path
 
 BUFFER_SUFFIX = ".bin"  # files that a glTF may keep its buffers in
 # Extensions that a file may require and that change nothing about where its triangles are, or that are decoded here.
-HARMLESS = {draco.EXTENSION, "KHR_mesh_quantization"}
+INSTANCING = "EXT_mesh_gpu_instancing"
+HARMLESS = {draco.EXTENSION, "KHR_mesh_quantization", INSTANCING}
 HARMLESS_PREFIXES = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_animation_", "KHR_xmp")
 DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}  # by componentType
 SHAPES = {  # (columns, rows) by type
     "SCALAR": (1, 1), "VEC2": (1, 2), "VEC3": (1, 3), "VEC4": (1, 4), "MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4),
 }  # fmt: skip
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives
+TRANSFORMS = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}  # attributes of instances, and their numbers
+# Extensions that cannot be done without, and what to do about a file that requires one.
+ADVICE = {
+    name: f"{name}: write it without that compression, as `gltfpack -i IN.glb -o OUT.glb -noq` does"
+    for name in ("EXT_meshopt_compression", "KHR_meshopt_compression")
+}
 SINGULAR = {"accessors": "accessor", "buffers": "buffer", "bufferViews": "buffer view", "meshes": "mesh", "nodes": "node",
             "scenes": "scene"}  # fmt: skip
 
@@ -64,7 +71,7 @@ class Gltf:
             raise Reject("unreadable", "extensionsRequired is not a list")
         unknown = sorted({str(e)[:60] for e in required if e not in HARMLESS and not str(e).startswith(HARMLESS_PREFIXES)})
         if unknown:
-            raise Reject("unsupported", f"requires {', '.join(unknown)}")
+            raise Reject("unsupported", f"requires {', '.join(ADVICE.get(name, name) for name in unknown)}")
         if draco.EXTENSION in required:
             draco.require_decoder()
 
@@ -95,9 +102,10 @@ class Gltf:
         """The bytes of one buffer: the GLB's own, a data URI, or a file inside the root."""
         uri = entry.get("uri")
         if uri is None:
+            for name in ADVICE:
+                if name in entry.get("extensions", {}):
+                    raise Reject("unsupported", f"it exists only as {ADVICE[name]}")
             if index:
-                if "EXT_meshopt_compression" in entry.get("extensions", {}):
-                    raise Reject("unsupported", "it exists only as EXT_meshopt_compression")
                 raise Reject("unreadable", "it has no data")
             return binary
         if not isinstance(uri, str):
@@ -210,14 +218,20 @@ class Gltf:
 
         The scene is the file's default one, else the first. A file without scenes shows all its nodes.
         """
-        nodes, scenes = self.tree["nodes"], self.tree["scenes"]
-        if scenes:
-            number = integer(self.tree, "scene", 0)
-            with at(f"scene {number}"):
-                roots = integers(self.entry("scenes", number), "nodes")
-        else:
-            below = {child for node in nodes for child in node.get("children", [])}
-            roots = [index for index in range(len(nodes)) if index not in below]
+        if not self.tree["scenes"]:
+            return self.walk(self.roots())
+        number = integer(self.tree, "scene", 0)
+        with at(f"scene {number}"):
+            return self.walk(integers(self.entry("scenes", number), "nodes"))
+
+    def roots(self) -> list[int]:
+        """The nodes that are below no other."""
+        nodes = self.tree["nodes"]
+        below = {child for node in nodes for child in node.get("children", [])}
+        return [index for index in range(len(nodes)) if index not in below]
+
+    def walk(self, roots: list[int]) -> Iterator[tuple[int, np.ndarray]]:
+        """These nodes and all below them, parents first, and the (4, 4) matrix of each to the scene."""
         queue = [(root, np.eye(4)) for root in dict.fromkeys(roots)]
         while queue:
             index, above = queue.pop()
@@ -236,6 +250,7 @@ class Primitive:
 
     def __init__(self, gltf: Gltf, mesh: int, number: int, entry: dict[str, Any]):
         self.gltf, self.entry, self.place = gltf, entry, f"mesh {mesh}: primitive {number}"
+        self.mesh = gltf.entry("meshes", mesh)
         with at(self.place):
             self._names = table(entry, "attributes")
             self._compressed = gltf.draco(entry)
@@ -246,20 +261,33 @@ class Primitive:
     def attribute(self, name: str, *widths: int) -> np.ndarray:
         """(V, n) numbers of an attribute, n one of the ``widths``; a Reject where it is missing or of another shape."""
         index = integer(self._names, name)
-        entry = self.gltf.entry("accessors", index)
+        shape = self._shape(index, name, widths)
         stored = self._compressed[1].get(name) if self._compressed else None
+        if stored is None:
+            return self.gltf.accessor(index)
+        with at(f"accessor {index}"):
+            if stored.shape != shape:
+                raise Reject("unreadable", f"{name} of {shape[0]} elements, its Draco data has {len(stored)}")
+            return numbers(stored, self.gltf.entry("accessors", index))
+
+    def target(self, number: int, name: str) -> np.ndarray:
+        """(V, 3) numbers that a morph target adds to an attribute at weight 1."""
+        with at(f"target {number}"):
+            index = integer(items(self.entry, "targets")[number], name)
+            self._shape(index, name, (3,))
+            return self.gltf.accessor(index)
+
+    def _shape(self, index: int, name: str, widths: tuple[int, ...]) -> tuple[int, int]:
+        """(V, n) that an accessor states, n one of the ``widths`` and V that of the positions; or a Reject."""
+        entry = self.gltf.entry("accessors", index)
         with at(f"accessor {index}"):
             count, (columns, rows), _ = layout(entry)
             if columns * rows not in widths:
                 raise Reject("unreadable", f"{name} of type {entry['type']}")
-            stated = layout(self.gltf.entry("accessors", self._names["POSITION"]))[0]
+            stated = layout(self.gltf.entry("accessors", integer(self._names, "POSITION")))[0]
             if count != stated:
                 raise Reject("unreadable", f"{name} of {count} elements beside {stated} positions")
-            if stored is not None and stored.shape != (count, columns * rows):
-                raise Reject("unreadable", f"{name} of {count} elements, its Draco data has {len(stored)}")
-            if stored is not None:
-                return numbers(stored, entry)
-        return self.gltf.accessor(index)
+            return count, columns * rows
 
     def has(self, name: str) -> bool:
         return name in self._names
@@ -371,6 +399,30 @@ def local_matrix(node: dict[str, Any]) -> np.ndarray:
     return matrix
 
 
+def instances(gltf: Gltf, node: dict[str, Any]) -> np.ndarray | None:
+    """(N, 4, 4) matrices of a node's copies in its own frame (EXT_mesh_gpu_instancing); None where it has none."""
+    extensions = table(node, "extensions") if "extensions" in node else {}
+    if INSTANCING not in extensions:
+        return None
+    with at(INSTANCING):
+        names = table(table(extensions, INSTANCING), "attributes")
+        parts = {name: gltf.accessor(integer(names, name)) for name in TRANSFORMS if name in names}
+        for name, values in parts.items():
+            if values.shape[1] != TRANSFORMS[name] or len(values) != len(next(iter(parts.values()))):
+                raise Reject("unreadable", f"{name} of {len(values)} times {values.shape[1]} numbers")
+            if not np.isfinite(values).all():
+                raise Reject("not_finite", f"{name} has a number that is not finite")
+        matrices = np.tile(np.eye(4), (len(next(iter(parts.values()), [0])), 1, 1))
+        for number, matrix in enumerate(matrices):
+            if "ROTATION" in parts:
+                matrix[:] = rotation(parts["ROTATION"][number].astype(np.float64))
+            if "SCALE" in parts:
+                matrix[:3, :3] *= parts["SCALE"][number]
+            if "TRANSLATION" in parts:
+                matrix[:3, 3] = parts["TRANSLATION"][number]
+        return matrices
+
+
 def rotation(quaternion: np.ndarray) -> np.ndarray:
     """(4, 4) matrix of a quaternion (x, y, z, w) of any length; the identity for one of no length."""
     length = quaternion @ quaternion
@@ -429,14 +481,40 @@ def check_graph(tree: dict[str, Any], max_faces: int) -> None:
                 mesh = integer(node, "mesh")
                 if mesh >= len(faces):
                     raise Reject("unreadable", f"mesh {mesh} does not exist, the file has {len(faces)}")
-                total += faces[mesh]
+                copies = _stated_instances(tree, node)
+                total += faces[mesh] * copies
+                if copies * _stated_vertices(tree, mesh) > 3 * max_faces and copies > 1:
+                    raise Reject("too_large", f"{copies} instances of {_stated_vertices(tree, mesh)} vertices")
     if total > max_faces:
         raise Reject("too_large", f"states {total} faces, at most {max_faces} are taken")
 
 
+def _stated_instances(tree: dict[str, Any], node: dict[str, Any]) -> int:
+    """Copies of a node's mesh that its instances state; 1 without any."""
+    extensions = table(node, "extensions") if "extensions" in node else {}
+    if INSTANCING not in extensions:
+        return 1
+    names = table(table(extensions, INSTANCING), "attributes")
+    stated = [integer(names, name) for name in TRANSFORMS if name in names]
+    return max((_stated_count(tree, index) for index in stated), default=1)
+
+
+def _stated_vertices(tree: dict[str, Any], mesh: int) -> int:
+    """Positions that the accessors of a mesh's largest primitive state."""
+    names = [table(primitive, "attributes") for primitive in primitives_of(tree["meshes"][mesh])]
+    return max((_stated_count(tree, integer(entry, "POSITION")) for entry in names if "POSITION" in entry), default=0)
+
+
+def _stated_count(tree: dict[str, Any], accessor: int) -> int:
+    accessors = tree.get("accessors", [])
+    if accessor >= len(accessors):
+        raise Reject("unreadable", f"accessor {accessor} does not exist, the file has {len(accessors)}")
+    return layout(accessors[accessor])[0]
+
+
 def _stated_faces(tree: dict[str, Any], mesh: int) -> int:
     """Triangles that the accessors of a mesh state."""
-    accessors, total = tree.get("accessors", []), 0
+    total = 0
     with at(f"mesh {mesh}"):
         for number, primitive in enumerate(primitives_of(tree["meshes"][mesh])):
             with at(f"primitive {number}"):
@@ -444,8 +522,6 @@ def _stated_faces(tree: dict[str, Any], mesh: int) -> int:
                     continue
                 attributes = table(primitive, "attributes")
                 indices = integer(primitive, "indices") if "indices" in primitive else integer(attributes, "POSITION")
-                if indices >= len(accessors):
-                    raise Reject("unreadable", f"accessor {indices} does not exist, the file has {len(accessors)}")
-                count = layout(accessors[indices])[0]
+                count = _stated_count(tree, indices)
                 total += count // 3 if mode == TRIANGLES else max(count - 2, 0)
     return total

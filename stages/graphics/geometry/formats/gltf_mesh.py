@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from stages.graphics.geometry.colours import Material
 from stages.graphics.geometry.formats import gltf_materials
 from stages.graphics.geometry.formats.gltf import Gltf, Primitive
+from stages.graphics.geometry.formats.gltf_pose import Poses
 from stages.graphics.geometry.formats.json_values import integer
-from stages.graphics.geometry.formats.parts import Part, Source, checked_part
+from stages.graphics.geometry.formats.parts import Part, Source
 
 
 def read(data: bytes, source: Source) -> list[Part]:
@@ -18,6 +16,7 @@ def read(data: bytes, source: Source) -> list[Part]:
     gltf = Gltf(data, source)
     source.about |= about(gltf.tree)
     materials = gltf_materials.read(gltf, source) if source.images is not None else []
+    poses = Poses(gltf, source)
     meshes: dict[int, list[Primitive]] = {}
     parts = []
     for index, matrix in gltf.placements():
@@ -28,23 +27,13 @@ def read(data: bytes, source: Source) -> list[Part]:
         if mesh not in meshes:
             meshes[mesh] = gltf.primitives(mesh)
         for primitive in meshes[mesh]:
-            if len(primitive.triangles):
-                parts.append(_part(primitive, matrix, materials, source))
+            if not len(primitive.triangles):
+                continue
+            for placed in poses.placed(index, matrix, primitive):
+                if source.images is not None:
+                    placed.part.look = gltf_materials.look(primitive, placed.part.triangles, materials, source)
+                parts.append(placed.part)
     return parts
-
-
-def _part(primitive: Primitive, matrix: np.ndarray, materials: list[tuple[Material, int]], source: Source) -> Part:
-    """A primitive in its place; a mirrored one with its triangles turned, so that they stay outward."""
-    part = checked_part(primitive.points, primitive.triangles, primitive.vertex_place, primitive.triangle_place)
-    with np.errstate(invalid="ignore", over="ignore"):
-        points = part.points @ matrix[:3, :3].T + matrix[:3, 3]
-    triangles = part.triangles
-    if np.linalg.det(matrix[:3, :3]) < 0:
-        triangles = triangles[:, ::-1]
-    part = checked_part(points, triangles, primitive.vertex_place, primitive.triangle_place)
-    if source.images is not None:
-        part.look = gltf_materials.look(primitive, part.triangles, materials, source)
-    return part
 
 
 def about(tree: dict[str, Any]) -> dict[str, str]:

@@ -1,13 +1,13 @@
 """Triangles of a USD stage, by the package usd-core, which is optional.
 
-Opens one file and the layers that it is composed of, which must lie inside the given root. Reads polygon meshes as they
-stand at the first time of the stage; a subdivision surface is its cage. Design choice: layers are looked at one by
-one before the stage is composed, since composing would open whatever they name.
+Opens one file and the layers that it is composed of, which must lie inside the given root. Reads meshes, shapes by formula and
+point instancers as they stand at the first time of the stage; a subdivision surface is its cage. Design choice: layers are
+looked at one by one before the stage is composed, since composing would open whatever they name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,13 @@ from pipeline.errors import Reject
 from stages.graphics.geometry import colours
 from stages.graphics.geometry.colours import as_colour
 from stages.graphics.geometry.formats.parts import Part, Source, checked_part
+from stages.graphics.geometry.formats.usd_shapes import placed_prims, polygons
 from stages.graphics.geometry.paths import check_path, inside
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 INSTALL = "USD files need the package usd-core: pip install usd-core"
 TEXTURES = {"diffuseColor": "colour", "emissiveColor": "emission"}
+COORDINATES = ("st", "UVMap", "st0", "map1")  # texture coordinates, the usual names
 WRAPS = {"clamp": "clamp", "mirror": "mirror"}  # all others repeat
 
 
@@ -113,52 +115,51 @@ def layers(path: Path, root: Path) -> list[Path]:
 
 
 def parts(stage: Any, root: Path, max_bytes: int, max_faces: int, images: colours.Images | None) -> Iterator[UsdPart]:
-    """The stage's visible meshes, a part for each material. ``images`` collects textures; None: none are read."""
+    """The stage's visible surfaces, a part for each material. ``images`` collects textures and notes; None: neither is read."""
     from pxr import Usd, UsdGeom, UsdShade
 
+    def note(text: str) -> None:
+        if images is not None and text not in images.notes:
+            images.notes.append(text)
+
     time = Usd.TimeCode.EarliestTime()
-    to_world, faces_so_far = UsdGeom.XformCache(time), 0
-    for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)):
-        mesh = UsdGeom.Mesh(prim)
-        if not mesh or mesh.ComputeVisibility(time) == UsdGeom.Tokens.invisible:
+    faces_so_far = points_so_far = 0
+    for prim, matrix, is_copy in placed_prims(stage, time, max_faces):
+        imageable = UsdGeom.Imageable(prim)
+        if not imageable or imageable.ComputeVisibility(time) == UsdGeom.Tokens.invisible:
             continue
-        if mesh.ComputePurpose() in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide):
+        if imageable.ComputePurpose() in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide):
             continue
-        counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get(time) or [], np.int64)
-        index = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(time) or [], np.int64)
-        points = np.asarray(mesh.GetPointsAttr().Get(time) or [], np.float64).reshape(-1, 3)
-        if counts.sum() != len(index) or (counts < 0).any():
-            raise Reject("unreadable", f"{prim.GetPath()}: faces of {counts.sum()} corners, but {len(index)} are stated")
-        faces_so_far += int(np.maximum(counts - 2, 0).sum())
-        if faces_so_far > max_faces:
+        shape = polygons(prim, time, note)
+        if shape is None:
+            continue
+        faces_so_far += len(shape.face)
+        points_so_far += len(shape.points) * is_copy
+        if max(faces_so_far, points_so_far / 3) > max_faces:
             raise Reject("too_large", f"states over {max_faces} faces")
-        corner, face = _fans(counts)
+        index, corner, face = shape.index, shape.corner, shape.face
         if not len(corner):
             continue
-        if index.min() < 0 or index.max() >= len(points):
-            raise Reject("bad_indices", f"{prim.GetPath()}: indices {index.min()}..{index.max()} for {len(points)} vertices")
-        matrix = np.asarray(to_world.GetLocalToWorldTransform(prim)).T  # USD multiplies rows
-        flipped = (mesh.GetOrientationAttr().Get(time) == "leftHanded") != (np.linalg.det(matrix[:3, :3]) < 0)
-        if flipped:
+        if index.min() < 0 or index.max() >= len(shape.points):
+            raise Reject(
+                "bad_indices", f"{prim.GetPath()}: indices {index.min()}..{index.max()} for {len(shape.points)} vertices"
+            )
+        mesh = UsdGeom.Mesh(prim)
+        left_handed = bool(mesh) and mesh.GetOrientationAttr().Get(time) == "leftHanded"
+        if left_handed != (np.linalg.det(matrix[:3, :3]) < 0):
             corner = corner[:, ::-1]
-        part = UsdPart(str(prim.GetPath()), points @ matrix[:3, :3].T + matrix[:3, 3], index[corner])
+        part = UsdPart(str(prim.GetPath()), shape.points @ matrix[:3, :3].T + matrix[:3, 3], index[corner])
         primvars = UsdGeom.PrimvarsAPI(prim)
-        part.uv = _primvar(primvars, ("st", "UVMap", "st0", "map1"), 2, corner, index, face, time)
+        part.uv = _primvar(primvars, COORDINATES, 2, corner, index, face, time)
         if part.uv is not None:
             part.uv = part.uv * [1, -1] + [0, 1]
         part.tint = _primvar(primvars, ("displayColor",), 3, corner, index, face, time)
-        part.normals = _normals(mesh, matrix, corner, index, face, time)
-        for rows, material in _materials(prim, len(counts), face, UsdGeom, UsdShade):
-            yield _with_material(part, rows, material, root, max_bytes, images)
-
-
-def _fans(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of polygons with so many corners: (F, 3) positions in the list of corners, and (F,) the polygon of each triangle."""
-    triangles = np.maximum(counts - 2, 0)
-    face = np.repeat(np.arange(len(counts)), triangles)
-    start = np.concatenate([[0], np.cumsum(counts)[:-1]])[face] if len(counts) else np.zeros(0, np.int64)
-    step = np.arange(len(face)) - np.repeat(np.concatenate([[0], np.cumsum(triangles)[:-1]]), triangles) if len(face) else face
-    return np.stack([start, start + step + 1, start + step + 2], axis=1).astype(np.int64).reshape(-1, 3), face
+        if shape.normals is not None:
+            part.normals = shape.normals[index[corner]] @ np.linalg.pinv(matrix[:3, :3])
+        elif mesh:
+            part.normals = _normals(mesh, matrix, corner, index, face, time)
+        for rows, material in _materials(prim, len(shape.counts), face, UsdGeom, UsdShade):
+            yield _with_material(part, rows, material, root, max_bytes, images, note)
 
 
 def _spread(values: Any, interpolation: str, corner: np.ndarray, index: np.ndarray, face: np.ndarray) -> np.ndarray | None:
@@ -205,13 +206,23 @@ def _materials(prim: Any, polygons: int, face: np.ndarray, geom: Any, shade: Any
         yield rows, binding.ComputeBoundMaterial()[0]
 
 
-def _with_material(part: UsdPart, rows: np.ndarray, material: Any, root: Path, max_bytes: int, images: Any) -> UsdPart:
+def _with_material(
+    part: UsdPart,
+    rows: np.ndarray,
+    material: Any,
+    root: Path,
+    max_bytes: int,
+    images: Any,
+    note: Callable[[str], None],
+) -> UsdPart:
     def of_rows(values: np.ndarray | None) -> np.ndarray | None:
         return None if values is None else values[rows]
 
     out = UsdPart(part.name, part.points, part.triangles[rows], of_rows(part.uv), of_rows(part.normals), of_rows(part.tint))
     shader = material.ComputeSurfaceSource()[0] if material else None
     if not shader or shader.GetIdAttr().Get() != "UsdPreviewSurface":
+        if material:
+            note(f"material {material.GetPrim().GetName()!r}: it has no UsdPreviewSurface, and its colour is not read")
         return out
     out.material = material.GetPrim().GetName()
     for stated in shader.GetInputs():
@@ -223,7 +234,11 @@ def _with_material(part: UsdPart, rows: np.ndarray, material: Any, root: Path, m
         out.inputs[name] = None  # given by what follows, if that is known
         if name in TEXTURES and images is not None:
             texture = _texture(sources[0].source.GetPrim(), root, max_bytes, images)
-            if texture is not None:
+            if texture is None:
+                note(f"material {out.material!r}: what gives its {name} is not read")
+            elif out.uv is None:
+                note(f"{out.name}: no texture coordinates ({', '.join(COORDINATES)}): its image is left out")
+            else:
                 out.textures[TEXTURES[name]] = texture
     return out
 
@@ -254,4 +269,25 @@ def _texture(prim: Any, root: Path, max_bytes: int, images: colours.Images) -> A
     image = images.get(str(asset.path), read)
     stated = [shader.GetInput(name) for name in ("wrapS", "wrapT")]
     wrap = tuple(WRAPS.get(str(one.Get()), "repeat") if one else "repeat" for one in stated)
-    return None if image is None else (image, wrap, np.eye(3)[:2])
+    return None if image is None else (image, wrap, _transform(shader))
+
+
+def _transform(texture: Any) -> np.ndarray:
+    """(2, 3) of (u, v, 1) with v running down, of the UsdTransform2d that a texture's coordinates pass through, if any."""
+    from pxr import UsdShade
+
+    given = texture.GetInput("st")
+    sources = given.GetConnectedSources()[0] if given and given.HasConnectedSource() else []
+    shader = UsdShade.Shader(sources[0].source.GetPrim()) if sources else None
+    if not shader or shader.GetIdAttr().Get() != "UsdTransform2d":
+        return np.eye(3)[:2]
+
+    def value(name: str, default: Any) -> np.ndarray:
+        stated = shader.GetInput(name).Get() if shader.GetInput(name) else None
+        return np.asarray(default if stated is None else stated, np.float64)
+
+    angle, scale, move = np.radians(value("rotation", 0.0)), value("scale", (1, 1)), value("translation", (0, 0))
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    upward, flip = np.eye(3), np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
+    upward[:2, :2], upward[:2, 2] = turn * scale, move
+    return (flip @ upward @ flip)[:2]
