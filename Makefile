@@ -12,7 +12,7 @@ TORCH_VERSION := 2.13.0
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 ARGS ?=
 SYSTEM ?= renderformer
-TABLE ?= table1_small
+TABLE ?=
 
 VENV := .venv
 RUN := $(VENV)/bin/python
@@ -77,7 +77,7 @@ probes: setup
 	@$(RUN) -m pipeline stage=probe $(if $(DEFAULT),shard.guides=true) probe=$(subst $(EMPTY) $(EMPTY),$(COMMA),$(PROBES)) -m $(ARGS)
 
 sweep: setup
-	@$(RUN) -m stages.cli sweep $(TABLE) $(ARGS)
+	@$(RUN) -m stages.cli sweep $(TABLE) $(if $(filter-out renderformer,$(SYSTEM)),system=$(SYSTEM)) $(ARGS)
 
 test: setup
 	@$(RUN) -m pytest -n auto --dist loadfile --durations=10 $(TESTS)
