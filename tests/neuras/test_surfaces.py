@@ -80,6 +80,21 @@ def test_poisson_finds_the_sphere_and_trims_what_no_point_supports():
     assert mesh.vertices[:, 2].min() > -0.3  # Poisson closes the lower half, far from any point
 
 
+def test_a_distance_field_finds_the_sphere_across_its_blocks():
+    points = sphere(5).vertices.astype(float)
+    half = points[points[:, 2] > 0]
+    mesh = reconstruct.distance_field(half, half / np.linalg.norm(half, axis=1, keepdims=True), 0.04, 0.15)
+    welded = simplify.weld(mesh, 1e-4)
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    assert np.abs(radii - np.median(radii)).max() < 0.01 and abs(np.median(radii) - np.linalg.norm(half, axis=1).mean()) < 0.003
+    assert mesh.vertices[:, 2].min() > -0.2 and len(welded.vertices) < len(mesh.vertices)  # more than one block
+    area = 2 * np.pi * np.median(radii) ** 2
+    assert measure.face_areas(welded.vertices, welded.faces).sum() == pytest.approx(area, rel=0.12)
+    corners = welded.vertices[welded.faces]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ij,ij->i", outward, corners.mean(axis=1)) > 0).mean() > 0.99
+
+
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)])
 def test_terrain_faces_up_and_drops_outliers(up):
     x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
