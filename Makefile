@@ -2,6 +2,7 @@
 # make data train eval SYSTEM=NAME    the same of another system
 # make sweep              table 1 of the paper, small: twelve variants over one dataset, and the table
 # make sweep TABLE=priors the same of the priors that a renderer may be given
+# make sweep SYSTEM=neuras  all tables of that system's paper, on one page
 # make test               the tests
 # Everything installs itself into .venv. All targets are phony: the store decides what is stale.
 

@@ -49,7 +49,7 @@ LOG_53 = {
     "training": "20,000 steps, learning rate 0.01",
     "perceptual loss": "VGG16",
 }
-PLAIN = "plain colours, same mesh and skyboxes"
+PLAIN = "plain colours"
 WARPING = "multi-view warping"
 
 

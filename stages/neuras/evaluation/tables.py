@@ -266,6 +266,8 @@ def here(row: Made, job: Job) -> list[tuple[str, str]]:
             f"{drawn['drawn_by']}, {drawn['size'][0]} x {drawn['size'][1]}; "
             f"{drawn['ratio']:.1f} times the time of a plain textured mesh"
         )
+    if networks := [name for name in row.held_out[0]["scores"]["ours"] if name.startswith("lpips_")]:
+        facts["LPIPS"] = f"by {networks[0].removeprefix('lpips_')}"
     if sets:
         facts["FID"] = (
             f"{sets[0]['photos']} photos, sets of " + ", ".join(sorted({str(one["views"]) for one in sets})) + " views"
@@ -318,7 +320,7 @@ def _ours(name: str, value: Mapping[str, Any] | None) -> Cell | None:
 
 
 def _published(name: str, value: float | None) -> Cell | None:
-    return None if value is None else Cell(COLUMNS[name].format(value), kind="soft")
+    return None if value is None else Cell(f"{value:.2f}" if name == "psnr" else f"{value:,.10g}", kind="soft")
 
 
 def _gain(value: Mapping[str, Any] | None) -> Cell | None:
