@@ -2,6 +2,7 @@
 # make data train eval SYSTEM=NAME    the same of another system
 # make sweep              table 1 of the paper, small: twelve variants over one dataset, and the table
 # make sweep TABLE=priors the same of the priors that a renderer may be given
+# make sweep SYSTEM=neuras  all tables of that system's paper, on one page
 # make test               the tests
 # Everything installs itself into .venv. All targets are phony: the store decides what is stale.
 
@@ -12,7 +13,7 @@ TORCH_VERSION := 2.13.0
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 ARGS ?=
 SYSTEM ?= renderformer
-TABLE ?= table1_small
+TABLE ?=
 
 VENV := .venv
 RUN := $(VENV)/bin/python
@@ -77,7 +78,7 @@ probes: setup
 	@$(RUN) -m pipeline stage=probe $(if $(DEFAULT),shard.guides=true) probe=$(subst $(EMPTY) $(EMPTY),$(COMMA),$(PROBES)) -m $(ARGS)
 
 sweep: setup
-	@$(RUN) -m stages.cli sweep $(TABLE) $(ARGS)
+	@$(RUN) -m stages.cli sweep $(TABLE) $(if $(filter-out renderformer,$(SYSTEM)),system=$(SYSTEM)) $(ARGS)
 
 test: setup
 	@$(RUN) -m pytest -n auto --dist loadfile --durations=10 $(TESTS)

@@ -32,8 +32,12 @@ def count(default: Any = ..., **kwargs: Any) -> Any:
 
 
 def report(default: Any = ..., **kwargs: Any) -> Any:
-    """A field that decides only files which ``finish`` makes: a change makes those anew, and takes every item over."""
-    return Field(default, json_schema_extra={"report": True}, **kwargs)
+    """A field that decides only files which ``finish`` makes: a change makes those anew, and takes every item over.
+
+    ``legacy``, where given, is that of `added`.
+    """
+    extra = {"report": True, **({"legacy": kwargs.pop("legacy")} if "legacy" in kwargs else {})}
+    return Field(default, json_schema_extra=extra, **kwargs)
 
 
 class Section(BaseModel):

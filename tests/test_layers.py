@@ -72,6 +72,7 @@ model.weights  model.pickles
 model.file_kinds
 model.errors
 model
+pipeline.experiments
 pipeline.__main__  pipeline.job  pipeline.commands
 pipeline.sweep  pipeline.repair
 pipeline.run

@@ -14,6 +14,7 @@ SYSTEM = System(
     },
     targets={"data": ("atlas",), "train": ("fit",), "eval": ("evaluate",)},
     commands="stages.neuras.commands:add_commands",
+    experiments="stages.neuras.evaluation.tables:EXPERIMENTS",
     views="stages.neuras.viewing:VIEWS",
     packages=(
         "lightmill",

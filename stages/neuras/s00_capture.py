@@ -161,7 +161,7 @@ class Capture(MapStage):
     def finish(self, config: StageConfig, inputs: Inputs, draft: Draft) -> None:
         from stages.neuras.captures import sanity, sheet
 
-        if isinstance(config, ImagesConfig):
+        if isinstance(config, ImagesConfig) or getattr(config, "true_mesh", False):
             draft.prepared.mkdir(exist_ok=True)
             self.prepare(config, inputs, draft.prepared)  # a run that took every frame over has not done it
         source = _source(config, draft.prepared)
@@ -188,12 +188,14 @@ class Capture(MapStage):
 
 
 def _source(config: StageConfig, prepared: Path | None = None) -> Source:
-    """The capture. prepared: the folder that ``prepare`` wrote to; without it images without poses have none."""
+    """The capture. prepared: the folder that ``prepare`` wrote to; without it images without poses have none, and a street has
+    no true mesh.
+    """
     from stages.neuras.captures import blendedmvs, colmap, images, nerf_synthetic, nerfstudio, pandaset
     from stages.neuras.street.source import StreetSource
 
     if isinstance(config, StreetCaptureConfig):
-        return StreetSource(config)
+        return StreetSource(config, prepared)
     if isinstance(config, ImagesConfig):
         return FolderSource(config, partial(images.read, prepared=prepared), images.root_of(config.path))
     readers = {

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from pipeline.config import StageConfig
+from pipeline.config import StageConfig, added
 from pipeline.errors import Reject, UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.graphics.arrays import pack_arrays, pack_json, unpack_json
@@ -26,11 +26,13 @@ if TYPE_CHECKING:
 class ScaffoldConfig(StageConfig):
     """Lengths end in ``_m``: metres, or nominal metres where the capture's unit is unknown (``CaptureInfo.metre``)."""
 
-    source: Literal["auto", "given", "poisson", "terrain"] = "auto"  # auto: given mesh, else Poisson, terrain under a flight
+    # auto: given mesh, else Poisson, terrain under a flight
+    source: Literal["auto", "given", "poisson", "terrain", "distance_field"] = "auto"
     voxel_m: float = Field(0.08, gt=0)  # points are thinned to one per voxel
     neighbours: int = Field(12, ge=4, le=64)  # of a point, for its normal
     depth: int = Field(11, ge=5, le=13)  # levels of Poisson's octree
     trim_m: float = Field(0.6, gt=0)  # reconstructed surface farther than this from all points goes
+    cell_m: float = added(0.2, legacy=0.2, gt=0)  # edge of the cubes that are marched through a distance field
     carve: bool = True  # drop what LiDAR beams went through
     carve_m: float = Field(0.3, gt=0)  # a beam may meet the surface so much before its end
     longest_m: float = Field(40.0, gt=0)  # longest side of a triangle of terrain, seen from above: bare ground has few points
@@ -127,7 +129,11 @@ def _surface(
         longest, outlier = config.longest_m * info.metre, config.outlier_m * info.metre
         return reconstruct.terrain(points, np.array(info.up), longest, outlier), stated
     point_normals = reconstruct.normals(points, viewers, config.neighbours)
-    mesh = reconstruct.poisson(points, point_normals, config.depth, config.trim_m * info.metre)
+    trim = config.trim_m * info.metre
+    if source == "distance_field":
+        mesh = reconstruct.distance_field(points, point_normals, config.cell_m * info.metre, trim)
+    else:
+        mesh = reconstruct.poisson(points, point_normals, config.depth, trim)
     if config.carve and info.points == "lidar":
         closed = len(mesh.faces)
         mesh = visibility.carved(mesh, *beams, config.carve_m * info.metre)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pipeline.config import StageConfig
+from pipeline.config import StageConfig, added
 from pipeline.errors import Reject, UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from pipeline.store.files import write_atomic
@@ -35,6 +35,7 @@ class AtlasConfig(StageConfig):
     max_megatexels: float = Field(4.0, gt=0, le=256)  # of the surface; densities are lowered to fit
     padding: int = Field(2, ge=1, le=16)  # texels between charts
     tile_faces: int = Field(4000, ge=100)  # a larger mesh is cut
+    charts: Literal["xatlas", "planar"] = added("xatlas", legacy="xatlas")  # planar: quick, for meshes of very many faces
 
 
 class Atlas(MapStage):
@@ -73,18 +74,19 @@ class Atlas(MapStage):
         return config, mesh, unfold.tiles(mesh, config.tile_faces), unpack_json((folder / PLAN).read_bytes())
 
     def process(self, worker: Any, item: Item) -> Iterator[Record]:
-        from stages.neuras.surfaces import unfold
+        from stages.neuras.surfaces import planar, unfold
 
         config, mesh, tiles, densities = worker
         index = int(item.id.removeprefix("tile_"))
-        tile = unfold.unfold(mesh, tiles[index], densities[index], config.padding)
+        by = unfold if config.charts == "xatlas" else planar
+        tile = by.unfold(mesh, tiles[index], densities[index], config.padding)
         if (tile.charts < 0).any():
             raise Reject("not_unfolded", f"{int((tile.charts < 0).sum())} of {len(tile.charts)} faces")
         yield Record(item.id, {"tile.npz": pack_arrays({name: np.asarray(value) for name, value in vars(tile).items()})})
 
     def finish(self, config: AtlasConfig, inputs: Inputs, draft: Draft) -> None:
         from stages.neuras.records import save
-        from stages.neuras.surfaces import unfold
+        from stages.neuras.surfaces import planar, unfold
 
         parts = []
         for row in draft.rows():
@@ -92,7 +94,8 @@ class Atlas(MapStage):
             parts.append(unfold.Tile(**{**arrays, "width": arrays["width"].item(), "height": arrays["height"].item()}))
         if not parts:
             raise UserError("no tile could be unfolded: see the rejects")
-        atlas = unfold.pack(parts, config.padding, config.size)
+        packer = unfold.by_xatlas if config.charts == "xatlas" else planar.pack
+        atlas = unfold.pack(parts, config.padding, config.size, packer=packer)
         save(draft.files / "atlas.npz", atlas)
         draft.note(
             "summary",

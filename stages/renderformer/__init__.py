@@ -18,6 +18,7 @@ SYSTEM = System(
     groups=("model",),
     targets={"data": ("shard",), "eval": ("evaluate",)},  # train is a stage
     commands="stages.renderformer.commands:add_commands",
+    experiments="stages.renderformer.evaluation.experiments:EXPERIMENTS",
     views="stages.renderformer.viewing:VIEWS",
     packages=(
         "lightmill", "torch", "mitsuba", "drjit", "trimesh", "pymeshlab", "libigl", "scikit-image", "numpy", "scipy",

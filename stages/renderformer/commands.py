@@ -115,23 +115,6 @@ def command_export(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def command_sweep(arguments: argparse.Namespace) -> int:
-    from stages.renderformer.evaluation import ablation, comparison
-
-    out = Path(arguments.out or f"runs/{arguments.table}")
-    if arguments.table in ablation.tables():
-        return ablation.sweep(arguments.table, arguments.rows, arguments.words, out)
-    return comparison.sweep(arguments.table, arguments.rows, arguments.words, out, arguments.until)
-
-
-def command_table(arguments: argparse.Namespace) -> int:
-    from stages.renderformer.evaluation import ablation, comparison
-
-    out = Path(arguments.out or f"runs/{arguments.table}")
-    write = ablation.write_table if arguments.table in ablation.tables() else comparison.write_page
-    return write(arguments.table, arguments.rows, arguments.words, out)
-
-
 def command_import(arguments: argparse.Namespace) -> int:
     from pipeline.__main__ import main as run_main
 
@@ -235,7 +218,7 @@ def add_commands(parsers: Any, program: str) -> None:
 
     def add(name: str, function, summary: str, example: str) -> argparse.ArgumentParser:
         sub = parsers.add_parser(name, help=summary, description=summary, epilog=f"example: {program} {name} {example}")
-        sub.set_defaults(function=function, takes_words=function in (command_import, command_sweep, command_table))
+        sub.set_defaults(function=function, takes_words=function is command_import)
         return sub
 
     sub = add("export", command_export, "scenes of a dataset as released HDF5 files", "shard exported --split test --images")
@@ -260,20 +243,6 @@ def add_commands(parsers: Any, program: str) -> None:
                      help="of a scene: of all light, or 'auto': as bright as the training data (default: 0)")  # fmt: skip
     of_scene, of_folder = "SCENE -o OUT [--triangles N] [--exposure STOPS]", "FOLDER [name=value ...] [--debug]"
     sub.usage = f"{program} import {of_scene}  |  {program} import {of_folder}"
-
-    for name, function, summary in (
-        ("sweep", command_sweep, "train and evaluate the rows of a table (the paper's table 1, priors), then write it"),
-        ("table", command_table, "write the table of the rows that the store holds"),
-    ):
-        sub = add(name, function, summary, "table1_small --rows full,no_dpt jobs=2")
-        sub.add_argument(
-            "table", nargs="?", default="table1_small", help="folder of conf/renderformer/experiment (default: table1_small)"
-        )
-        sub.add_argument("--rows", type=lambda text: text.split(","), help="some rows, comma-separated (default: all)")
-        sub.add_argument("-o", "--out", help="folder of what is written: table.* or report.* (default: runs/TABLE)")
-        if name == "sweep":
-            sub.add_argument("--until", choices=("train", "evaluate"), default="evaluate", help="stop after this stage")
-        sub.usage = f"{program} {name} [TABLE] [--rows ROW,...] [-o FOLDER] [name=value ...] [--debug]"
 
     scene_help = (
         "scene file in a released format (.json, .h5), or a mesh or scene (.glb, .gltf, .usd*, .obj, .off, .ply, .stl, ..)"

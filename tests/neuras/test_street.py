@@ -164,3 +164,41 @@ def test_depth_agrees_with_the_lidar(source):
 def test_settings_that_make_no_sense_are_told(wrong, says):
     with pytest.raises(ValidationError, match=says):
         StreetConfig(**wrong)
+
+
+# --- objects ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("thing", ["car", "house", "tree"])
+def test_an_object_is_seen_whole_from_all_sides_and_scanned(thing, tmp_path):
+    config = StreetConfig(
+        preset="object", object=thing, texture_size=64, width=40, height=40, fov_deg=40, training_frames=6, spp=2, columns=60
+    )
+    prepare(config, tmp_path)
+    backend.activate(backend.choose(), threads=1)
+    source = StreetSource(config, tmp_path)
+    ids = [id for id, _ in source.items()]
+    splits = [split for _, split in source.items()]
+    assert splits.count("train") == 6 and splits.count("test") + splits.count("validation") == 6
+    positions = []
+    for id in [id for id in ids if id.startswith("frame-")][::4]:
+        frame = source.frame(id)
+        positions.append(frame.camera.position)
+        border = np.ones((40, 40), bool)
+        border[1:-1, 1:-1] = False
+        assert (frame.image()[border] > 250).mean() > 0.99 and (frame.depth[border] == 0).all()  # white around it
+        seen = frame.depth > 0
+        assert seen.mean() > 0.05 and frame.image()[seen].mean() < 250
+    assert np.ptp(np.array(positions), axis=0).min() > 2
+    _, faces = City.load(tmp_path).mesh()
+    points = source.points(next(id for id in ids if id.startswith("points-"))).points
+    assert len(faces) > 1000 and len(points) > 100
+    assert source.mesh() is None and source.info().source["object"] == thing
+
+
+def test_the_true_mesh_ends_where_the_lidar_does(folder):
+    given = StreetSource(SMALL.model_copy(update={"true_mesh": True}), folder).mesh()
+    vertices, faces = City.load(folder).mesh()
+    assert 0.5 * len(faces) < len(given.faces) < len(faces)
+    places = np.array([pose.camera.position for pose in poses(SMALL) if pose.split == "train"])
+    assert np.abs(given.vertices[:, :2] - places.mean(axis=0)[:2]).max() < 160 < np.abs(vertices[:, :2]).max()

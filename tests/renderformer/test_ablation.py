@@ -89,7 +89,7 @@ def test_sizes_are_those_that_the_paper_states():
 
 
 def test_a_wrong_row_table_or_dataset_is_told():
-    with pytest.raises(UserError, match="table1, table1_small"):
+    with pytest.raises(UserError, match="table 'table2' is unknown: choose from default, priors, table1, table1_small"):
         jobs_of("table2", None, [])
     with pytest.raises(UserError, match="no_dtp is unknown.*no_dpt"):
         jobs_of("table1_small", ["no_dtp"], [])
@@ -137,9 +137,7 @@ def test_the_table_says_what_ran_what_did_not_and_what_differs(monkeypatch, tmp_
         "full": result({"a": [20.0, 30.0], "b": [10.0], "c": [20.0]}),
         "no_dpt": result({"a": [19.0, 29.0], "b": [9.0], "c": [19.0]}),
     }
-    monkeypatch.setattr(
-        ablation, "load", lambda job, store: results.get(job.plan["train"].config.model.name.replace("base", "full"))
-    )
+    monkeypatch.setattr(ablation, "load", lambda job: results.get(job.plan["train"].config.model.name.replace("base", "full")))
     words = [f"store={tmp_path}/store", "train.steps=7"]
     assert write_table("table1_small", None, words, tmp_path / "out") == 1  # rows are missing
     assert "no_self_attention" in capsys.readouterr().out

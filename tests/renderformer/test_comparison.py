@@ -8,17 +8,18 @@ import subprocess
 import pytest
 
 from pipeline.errors import UserError
-from stages.renderformer.evaluation import comparison
-from stages.renderformer.evaluation.comparison import jobs_of, rows_of, tables
+from pipeline.experiments import Table, experiments_of
+from stages.renderformer.evaluation import ablation, comparison
+from stages.renderformer.evaluation.comparison import jobs_of
 from tests.conftest import ROOT
 
 
 def test_the_papers_tables_are_no_comparisons():
-    assert tables() == ["default", "priors"]
-    with pytest.raises(UserError, match="table 'prior' is unknown: choose from table1, table1_small, default, priors"):
-        rows_of("prior", None)
+    assert ablation.names() == ["table1", "table1_small"] and experiments_of("renderformer").default == "table1_small"
+    with pytest.raises(UserError, match="table 'prior' is unknown: choose from default, priors, table1, table1_small"):
+        Table.of("renderformer", "prior")
     with pytest.raises(UserError, match="row x is unknown: choose from guided, renderformer"):
-        rows_of("default", ["x"])
+        Table.of("renderformer", "default").chosen(["x"])
 
 
 def test_every_rung_gives_one_thing_more_and_all_read_one_dataset():
@@ -49,7 +50,7 @@ def test_seeds_are_runs_of_their_own():
 
 
 def test_rows_on_several_datasets_are_refused():
-    with pytest.raises(UserError, match="the rows of default read 2 different datasets"):
+    with pytest.raises(UserError, match="the rows of default read 2 different artifacts of stage shard"):
         jobs_of("default", None, ["scene.count.train=10,20"])
 
 

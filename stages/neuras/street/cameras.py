@@ -1,4 +1,4 @@
-"""Where the cameras stand: a driven lane with held-out frames and lanes beside it, or a flight in a grid.
+"""Where the cameras stand: a driven lane with held-out frames and lanes beside it, a flight in a grid, or around an object.
 
 Everything here follows from the settings alone, so items are known before the place is made.
 """
@@ -16,6 +16,8 @@ from stages.neuras.street.settings import StreetConfig
 
 LANE = -1.0  # metres: y of the driven lane; 3 m to both sides of it no car is parked
 HEIGHT = 1.6  # of the camera above the road
+OBJECTS = {"car": (2.7, 0.75), "house": (10.6, 7.5), "tree": (3.3, 3.2)}  # metres: radius of a ball, height of its middle
+LOWEST, HIGHEST = 5.0, 75.0  # degrees above the horizon, of cameras around an object
 VALIDATION_EVERY = 5  # of the held-out frames, one in five chooses settings; the others are the test
 
 
@@ -33,7 +35,7 @@ class Pose:
 
 def poses(config: StreetConfig) -> list[Pose]:
     """All frames of a capture."""
-    return _street(config) if config.preset == "street" else _flight(config)
+    return {"street": _street, "drone": _flight, "object": _around}[config.preset](config)
 
 
 def start(config: StreetConfig) -> float:
@@ -107,4 +109,24 @@ def _flight(config: StreetConfig) -> list[Pose]:
         place = held.get(number)
         split: Split = "train" if place is None else "validation" if place % VALIDATION_EVERY == 0 else "test"
         out.append(Pose(f"frame-flight_{number:04d}", camera, split, "flight", time=2.0 * number))
+    return out
+
+
+def _around(config: StreetConfig) -> list[Pose]:
+    """Cameras over the upper half of a ball around an object, on a spiral; every other one is held out."""
+    radius, height = OBJECTS[config.object]
+    middle = np.array([0.0, 0.0, height])
+    half = np.tan(np.radians(config.fov_deg / 2)) * min(1.0, config.height / config.width)  # of the narrower side
+    away = radius / np.sin(np.arctan(half))
+    count = 2 * config.training_frames
+    low, high = np.sin(np.radians([LOWEST, HIGHEST]))
+    out = []
+    for number in range(count):
+        up = low + (high - low) * (number + 0.5) / count
+        angle = number * np.pi * (3 - np.sqrt(5))  # the golden angle: no two cameras stand above each other
+        across = np.sqrt(1 - up * up)
+        position = middle + away * np.array([across * np.cos(angle), across * np.sin(angle), up])
+        between = number // 2 % VALIDATION_EVERY == VALIDATION_EVERY // 2
+        split: Split = "train" if number % 2 == 0 else "validation" if between else "test"
+        out.append(Pose(f"frame-around_{number:04d}", look(config, position, middle - position), split, "around"))
     return out

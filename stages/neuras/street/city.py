@@ -1,4 +1,4 @@
-"""A city made of numbers: a street of houses (``street``) or blocks with gardens (``drone``), from a seed.
+"""A city made of numbers: a street of houses (``street``), blocks with gardens (``drone``) or one ``object``, from a seed.
 
 World: metres, right-handed, z up. The street runs along x and its middle is y = 0; the road's surface is z = 0. The skyline
 lies about FAR metres and more beyond the street's ends.
@@ -92,12 +92,15 @@ class City:
         return cls(groups, arrays["sky"], arrays["sun"], about["houses"])
 
 
-def make(preset: str, seed: int, length: float, texture_size: int = 1024) -> City:
-    """The city of a seed. ``length``: of the street, or of each side of the blocks, metres."""
+def make(preset: str, seed: int, length: float, texture_size: int = 1024, thing: str = "car") -> City:
+    """The city of a seed. ``length``: of the street, or of each side of the blocks, metres. ``thing``: which object."""
     rng = np.random.default_rng([seed, 1])
     shapes = Shapes()
-    houses = _street(shapes, rng, length) if preset == "street" else _blocks(shapes, rng, length)
-    _skyline(shapes, rng, length, preset)
+    if preset == "object":
+        houses = _object(shapes, rng, thing)
+    else:
+        houses = _street(shapes, rng, length) if preset == "street" else _blocks(shapes, rng, length)
+        _skyline(shapes, rng, length, preset)
     palette = _palette(np.random.default_rng([seed, 2]))
     groups = []
     for number, name in enumerate(sorted(shapes.soups)):
@@ -544,3 +547,18 @@ def _park(shapes: Shapes, rng: np.random.Generator, width: float, depth: float) 
             furniture.tree(shapes.at(x, y, 0.1), rng, rng.uniform(5, 11), 900)
     for x in np.arange(8, width - 8, 6):
         furniture.bench(shapes.at(x, depth / 2 - 2, 0.12), rng)
+
+
+# --- one object, seen from all sides ----------------------------------------------------------------------------------
+
+
+def _object(shapes: Shapes, rng: np.random.Generator, thing: str) -> int:
+    """A thing around the z axis, on z = 0, without anything around it; returns how many houses that is."""
+    if thing == "car":
+        furniture.car(shapes, rng, "suv")
+    elif thing == "tree":
+        furniture.tree(shapes, rng, 6.0, 2500)
+    else:
+        style = Style.draw(rng, WALLS, ROOFS, (1, 2), False, ("gable",))
+        building(shapes.at(-4.5, 4.0), rng, 9.0, 8.0, style, (True, True))
+    return int(thing == "house")

@@ -28,12 +28,15 @@ LENS = 0.5  # pixels: deviation of the spot that a lens makes of a point. A box 
 
 
 class Renderer:
-    """A city as a Mitsuba scene: built once, rendered often. The variant must be set (``stages.graphics.mitsuba.backend``)."""
+    """A city as a Mitsuba scene: built once, rendered often. The variant must be set (``stages.graphics.mitsuba.backend``).
 
-    def __init__(self, city: City, caster: Caster):
+    ``over_white``: where nothing stands there is white in place of the sky, which still lights what does.
+    """
+
+    def __init__(self, city: City, caster: Caster, over_white: bool = False):
         import mitsuba as mi
 
-        self.city, self.caster = city, caster
+        self.city, self.caster, self.over_white = city, caster, over_white
         self.uvs = np.concatenate([group.uvs for group in city.groups])
 
         turn = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
@@ -54,11 +57,13 @@ class Renderer:
         """(H, W, 3) float32, linear, denoised."""
         import mitsuba as mi
 
-        integrator = mi.load_dict({"type": "path", "max_depth": BOUNCES})
-        image = np.array(mi.render(self.scene, sensor=_sensor(mi, camera), integrator=integrator, spp=spp, seed=seed))
+        integrator = mi.load_dict({"type": "path", "max_depth": BOUNCES, "hide_emitters": self.over_white})
+        sensor = _sensor(mi, camera, "rgba" if self.over_white else "rgb")
+        image = np.array(mi.render(self.scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed))
         colour = np.minimum(np.nan_to_num(image[..., :3]), 30.0)  # a firefly is no light to spread
         albedo, normal = self._guides(camera)
-        return denoise(colour, albedo, normal, np.ones(colour.shape[:2]))
+        denoised = denoise(colour, albedo, normal, np.ones(colour.shape[:2]))
+        return denoised + (1 - image[..., 3:]) / EXPOSURE if self.over_white else denoised
 
     def _guides(self, camera: Camera, side: int = 2) -> tuple[np.ndarray, np.ndarray]:
         """Albedo and normal (H, W, 3) for the denoiser, each the mean of ``side`` x ``side`` rays a pixel.
@@ -94,7 +99,7 @@ class Renderer:
         return out.getvalue()
 
 
-def _sensor(mi: Any, camera: Camera) -> Any:
+def _sensor(mi: Any, camera: Camera, pixel_format: str) -> Any:
     flip = np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba's cameras look along +z with +x to the left
     return mi.load_dict(
         {
@@ -105,7 +110,7 @@ def _sensor(mi: Any, camera: Camera) -> Any:
             "far_clip": 1e4,
             "to_world": mi.ScalarTransform4f(camera.camera_to_world @ flip),
             "film": {
-                "type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgb",
+                "type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": pixel_format,
                 "rfilter": {"type": "box"},
             },
             "sampler": {"type": "multijitter"},

@@ -6,13 +6,16 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from pipeline.config import Section
+from pipeline.config import Section, added, report
+
+ObjectName = Literal["car", "house", "tree"]
 
 
 class StreetConfig(Section):
     """A procedural place, its cameras and its LiDAR. Lengths in metres."""
 
-    preset: Literal["street", "drone"] = "street"
+    preset: Literal["street", "drone", "object"] = "street"
+    object: ObjectName = added("car", legacy="car")  # of the preset object: one thing over white, from all sides
     seed: int = Field(0, ge=0)  # of the place; another seed, another place
     length: float = Field(260.0, ge=90, le=2000)  # of the street, or of each side of the blocks
     texture_size: int = Field(1024, ge=64, le=4096)  # pixels along a wall's texture, which spans 7.5 m
@@ -27,6 +30,7 @@ class StreetConfig(Section):
     speed: float = Field(5.0, gt=0)  # of the car that carries the LiDAR, m/s; it turns ten times a second
     beams: int = Field(64, ge=1)
     columns: int = Field(900, ge=8)  # directions of one turn
+    true_mesh: bool = report(False, legacy=False)  # what was path traced is given as the mesh, as far as the LiDAR reaches
 
     @model_validator(mode="after")
     def _fits(self) -> StreetConfig:

@@ -9,17 +9,24 @@ import numpy as np
 
 from pipeline.keys import seed_for
 from stages.graphics.casting import Caster
-from stages.neuras.records import CaptureInfo, FrameRecord, PointsRecord
+from stages.neuras.records import CaptureInfo, FrameRecord, Mesh, PointsRecord
 from stages.neuras.street import lidar
 from stages.neuras.street.cameras import poses
 from stages.neuras.street.city import City, make
 from stages.neuras.street.rendering import Renderer
 from stages.neuras.street.settings import StreetConfig
 
+AROUND = {"street": 60.0, "drone": 30.0, "object": 0.0}  # metres that are seen beyond the cameras
+RULES = {
+    "street": "every other frame of the drive is held out",
+    "drone": "a random half of the frames is held out",
+    "object": "every other frame is held out",
+}
+
 
 def prepare(config: StreetConfig, folder: Path) -> None:
     """Make the place once, for all workers."""
-    make(config.preset, config.seed, config.length, config.texture_size).save(folder)
+    make(config.preset, config.seed, config.length, config.texture_size, config.object).save(folder)
 
 
 class StreetSource:
@@ -58,12 +65,8 @@ class StreetSource:
         config = self.config
         places = np.array([pose.camera.position for pose in self._poses.values() if pose.split == "train"])
         centre = 0.5 * (places.min(axis=0) + places.max(axis=0))
-        radius = 0.5 * float(np.linalg.norm(np.ptp(places, axis=0))) + (60.0 if config.preset == "street" else 30.0)
-        rule = (
-            "every other frame of the drive is held out"
-            if config.preset == "street"
-            else "a random half of the frames is held out"
-        )
+        radius = 0.5 * float(np.linalg.norm(np.ptp(places, axis=0))) + AROUND[config.preset]
+        rule = RULES[config.preset]
         return CaptureInfo(
             units="metre",
             metre=1.0,
@@ -72,11 +75,24 @@ class StreetSource:
             radius=radius,
             points="lidar",
             split_rule=f"{rule}; of the held-out, every fifth is for validation, the others are the test",
-            source={"name": "street", "preset": config.preset, "seed": config.seed, "licence": "made by this program"},
+            source={
+                "name": "street",
+                "preset": config.preset,
+                **({"object": config.object} if config.preset == "object" else {}),
+                "seed": config.seed,
+                "licence": "made by this program",
+            },
         )
 
-    def mesh(self) -> None:
-        """No mesh is given: the scaffold has to be reconstructed."""
+    def mesh(self) -> Mesh | None:
+        """The true mesh as far as the LiDAR reaches, where the settings ask for it; else a scaffold is reconstructed."""
+        if not self.config.true_mesh:
+            return None
+        vertices, faces = self._city.mesh()
+        places = np.array([pose.camera.position for pose in self._poses.values() if pose.split == "train"])
+        centres = vertices[faces].mean(axis=1)
+        near = np.linalg.norm(centres - np.clip(centres, places.min(axis=0), places.max(axis=0)), axis=1)
+        return Mesh.compact(vertices, faces[near < lidar.REACH[self.config.preset]])
 
     @functools.cached_property
     def _city(self) -> City:
@@ -90,4 +106,4 @@ class StreetSource:
 
     @functools.cached_property
     def _renderer(self) -> Renderer:
-        return Renderer(self._city, self._caster)
+        return Renderer(self._city, self._caster, self.config.preset == "object")

@@ -3,5 +3,6 @@
 ``reconstruct``  a surface through points: screened Poisson, or a terrain by Delaunay
 ``simplify``     near vertices welded, quadric edge collapse
 ``visibility``   faces that no camera sees go
-``unfold``       charts, tile by tile, packed into one texture
+``unfold``       charts by xatlas, tile by tile, packed into one texture
+``planar``       the same without xatlas, quicker and less well
 """

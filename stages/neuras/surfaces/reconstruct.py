@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
 from stages.graphics.geometry import measure
 from stages.neuras.records import Mesh
+
+BLOCK = 32  # cubes along a block that is marched at a time
+NEAREST = 8  # points that decide the distance to the surface
 
 
 def thin(points: np.ndarray, voxel: float, *others: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -60,6 +65,45 @@ def poisson(points: np.ndarray, point_normals: np.ndarray, depth: int, trim: flo
     vertices, faces = mesh.vertex_matrix(), np.asarray(mesh.face_matrix(), np.int64)
     near = cKDTree(points).query(vertices, distance_upper_bound=trim)[0] <= trim
     return Mesh.compact(vertices, faces[near[faces].all(axis=1)])
+
+
+def distance_field(points: np.ndarray, point_normals: np.ndarray, cell: float, trim: float) -> Mesh:
+    """Marching cubes of a signed distance that is known within ``trim`` of the points, as other reconstructions leave it.
+
+    The distance at a place is the weighted mean of those to the planes of its nearest points (implicit moving least squares).
+    Cubes of edge ``cell`` are marched block by block, so memory does not grow with the empty space between surfaces.
+    Neighbouring blocks share the places of their vertices, not the vertices.
+    """
+    from skimage.measure import marching_cubes
+
+    tree, origin = cKDTree(points), points.min(axis=0) - 2 * trim
+    sides = np.array(list(itertools.product((-trim, trim), repeat=3)))
+    near = (points[:, None] + sides - origin).reshape(-1, 3)
+    corners = np.stack(np.meshgrid(*[np.arange(BLOCK + 1)] * 3, indexing="ij"), axis=-1)
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+    for block in np.unique(np.floor(near / (cell * BLOCK)).astype(np.int64), axis=0):
+        places = origin + cell * (block * BLOCK + corners)
+        field = _signed_distances(places.reshape(-1, 3), tree, point_normals, trim).reshape(corners.shape[:3])
+        known = np.isfinite(field)
+        if not known.any() or np.nanmin(field) >= 0 or np.nanmax(field) <= 0:
+            continue
+        found, triangles, _, _ = marching_cubes(np.where(known, field, trim), 0.0)
+        sure = known[tuple(np.floor(found).astype(int).T)] & known[tuple(np.ceil(found).astype(int).T)]
+        vertices.append(origin + cell * (block * BLOCK + found))
+        faces.append(triangles[sure[triangles].all(axis=1)] + count)
+        count += len(found)
+    return Mesh.compact(np.concatenate(vertices), np.concatenate(faces))
+
+
+def _signed_distances(places: np.ndarray, tree: cKDTree, point_normals: np.ndarray, trim: float) -> np.ndarray:
+    """(P,) distance of ``places`` to the surface of the tree's points, positive outside; NaN farther than ``trim`` from all."""
+    apart, near = tree.query(places, k=NEAREST, distance_upper_bound=trim)
+    there = np.isfinite(apart)
+    near = np.where(there, near, 0)
+    planes = np.einsum("pki,pki->pk", point_normals[near], places[:, None] - tree.data[near])
+    closest = np.where(there[:, :1], apart[:, :1], 1.0)
+    weights = np.where(there, np.exp(-np.square(np.where(there, apart, 0.0) / (closest + 0.1 * trim))), 0.0)
+    return np.where(there[:, 0], (weights * planes).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-300), np.nan)
 
 
 def terrain(points: np.ndarray, up: np.ndarray, longest: float, outlier: float) -> Mesh:

@@ -6,6 +6,7 @@ own, since far walls need fewer texels than the road in front of the camera.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,13 +74,41 @@ def unfold(mesh: Mesh, rows: np.ndarray, texels_per_unit: float, padding: int) -
     )
 
 
-def pack(parts: list[Tile], padding: int, size: int | None = None, multiple: int = 16) -> AtlasMesh:
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Charts in one rectangle. copies: (N,) which given vertex each is; faces: (F, 3) int32; uvs: (N, 2) float32 in texels."""
+
+    copies: np.ndarray
+    faces: np.ndarray
+    uvs: np.ndarray
+    width: int
+    height: int
+
+
+Packer = Callable[[np.ndarray, np.ndarray, np.ndarray, int], Placed]  # uvs in texels, faces, charts, padding
+
+
+def by_xatlas(uvs: np.ndarray, faces: np.ndarray, charts: np.ndarray, padding: int) -> Placed:
+    """Charts packed closely, each at its own size. It finds them by itself: no two may touch in ``uvs``."""
+    import xatlas
+
+    atlas = xatlas.Atlas()
+    atlas.add_uv_mesh(np.ascontiguousarray(uvs, np.float32), np.ascontiguousarray(faces, np.uint32))
+    options = xatlas.PackOptions()
+    options.texels_per_unit = 1.0
+    options.padding = int(padding)
+    options.bilinear = True
+    atlas.generate(pack_options=options)
+    copies, packed, placed = atlas.get_mesh(0)
+    size = (atlas.width, atlas.height)
+    return Placed(copies, np.asarray(packed, np.int32).reshape(-1, 3), np.asarray(placed) * size, *size)
+
+
+def pack(parts: list[Tile], padding: int, size: int | None = None, multiple: int = 16, packer: Packer = by_xatlas) -> AtlasMesh:
     """One texture of all charts of all tiles, each at its own size: about square, sides multiples of ``multiple``.
 
     With ``size`` the texture is ``size`` x ``size``, and charts that do not fit are made smaller by one factor for all.
     """
-    import xatlas
-
     first_vertex = np.cumsum([0, *(len(part.vertices) for part in parts)])
     first_chart = np.cumsum([0, *(int(part.charts.max(initial=-1)) + 1 for part in parts)])
     left = np.cumsum([0, *(part.width + 16 for part in parts)])  # tiles side by side, so that no two charts touch
@@ -87,24 +116,15 @@ def pack(parts: list[Tile], padding: int, size: int | None = None, multiple: int
     faces = np.concatenate([part.faces + first for part, first in zip(parts, first_vertex, strict=False)])[order]
     charts = np.concatenate([part.charts + first for part, first in zip(parts, first_chart, strict=False)])[order]
     spread = np.concatenate([part.uvs + (x, 0) for part, x in zip(parts, left, strict=False)]).astype(np.float32)
-
-    atlas = xatlas.Atlas()
-    atlas.add_uv_mesh(np.ascontiguousarray(spread), np.ascontiguousarray(faces, np.uint32))
-    options = xatlas.PackOptions()
-    options.texels_per_unit = 1.0
-    options.padding = int(padding)
-    options.bilinear = True
-    atlas.generate(pack_options=options)
-    copies, packed, uvs = atlas.get_mesh(0)
-    width, height = atlas.width, atlas.height
-    texels = np.asarray(uvs) * (width, height)
+    placed = packer(spread, faces, charts, padding)
+    width, height, texels = placed.width, placed.height, placed.uvs
     if size is not None:
-        texels *= min(1.0, size / max(width, height))
+        texels = texels * min(1.0, size / max(width, height))
     width, height = (size, size) if size else (-(-side // multiple) * multiple for side in (width, height))
     return AtlasMesh(
-        vertices=np.concatenate([part.vertices for part in parts])[copies].astype(np.float32),
+        vertices=np.concatenate([part.vertices for part in parts])[placed.copies].astype(np.float32),
         uvs=(texels / (width, height)).astype(np.float32),
-        faces=np.asarray(packed, np.int32).reshape(-1, 3),
+        faces=placed.faces,
         charts=charts.astype(np.int32),
         width=int(width),
         height=int(height),

@@ -1,30 +1,27 @@
 """Table 1 of the paper: its rows as one sweep over one dataset, and the table with the paper's numbers beside ours.
 
 Reads ``conf/renderformer/experiment/<table>/``, a file per row, and from the store what *evaluate* and *train* left for
-each. Writes ``table.md``, ``table.json`` and ``table.png``. One design choice: a row is found by its key, computed from its
-config, so that the table never shows another run than the one that the files describe. Paper: section 4.1.
+each. Writes ``table.md``, ``table.json`` and ``table.png``. Paper: section 4.1.
 """
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.atomic import write_atomic
-from pipeline.errors import UserError
-from pipeline.hydra_config import CONF
+from pipeline.errors import INTERRUPTED, UserError
+from pipeline.experiments import Order, Table, made, only_planned, tables
 
 if TYPE_CHECKING:
-    from pipeline.store import Artifact, Store
+    from pipeline.store import Artifact
     from pipeline.sweep import Job
 
 COLUMNS = {"psnr": "PSNR", "ssim": "SSIM", "lpips_vgg": "LPIPS", "flip": "FLIP"}  # our metric -> the paper's column
 DRAWN = ("psnr", "flip")  # columns of the figure
-INTERRUPTED = 130  # exit status after Ctrl-C
 BASE = "full"  # the row that the others are held against
 
 
@@ -75,63 +72,47 @@ PAPER = {
 }
 
 
-def tables() -> list[str]:
-    return sorted(path.name for path in (CONF / "renderformer" / "experiment").glob("table1*") if path.is_dir())
+def names() -> list[str]:
+    """The tables that are the paper's table 1."""
+    return [name for name in tables("renderformer") if name.startswith("table1")]
 
 
-def jobs_of(table: str, names: Sequence[str] | None, overrides: Sequence[str]) -> dict[str, Job]:
+def table_of(name: str) -> Table:
+    return Table.of("renderformer", name, [row.name for row in ROWS])
+
+
+def jobs_of(table: str, rows: Sequence[str] | None, overrides: Sequence[str]) -> dict[str, Job]:
     """Row name -> its job, in the table's order; a UserError unless all of them read the same shards."""
-    from pipeline.sweep import expand
-
-    if table not in tables():
-        raise UserError(f"table {table!r} is unknown: choose from {', '.join(tables())}")
-    row_names = [row.name for row in ROWS]
-    if unknown := [name for name in names or () if name not in row_names]:
-        raise UserError(f"row {', '.join(unknown)} is unknown: choose from {', '.join(row_names)}")
-    rows = [name for name in row_names if names is None or name in names]
-    expanded = expand([*words(table, rows), *overrides])
-    if len(expanded) != len(rows):
+    jobs = table_of(table).jobs(rows, overrides)
+    if len({row for row, _ in jobs}) != len(jobs):
         raise UserError("a table is a sweep over its rows alone: give each override one value")
-    shards = {job.keys["shard"] for job in expanded}
-    if len(shards) > 1:
-        raise UserError(f"the rows of {table} read {len(shards)} different datasets: they may differ in model alone")
-    return dict(zip(rows, expanded, strict=True))
+    table_of(table).one_artifact(jobs, "shard", "model")
+    return dict(jobs)
 
 
-def words(table: str, rows: Sequence[str]) -> list[str]:
-    return ["stage=evaluate", "experiment=" + ",".join(f"{table}/{row}" for row in rows)]
-
-
-def sweep(table: str, names: Sequence[str] | None, overrides: Sequence[str], out: Path) -> int:
+def sweep(order: Order) -> int:
     """Train and evaluate what is missing of the rows, then write the table; returns the exit status.
 
-    Unless ``jobs=N`` is among the overrides: as many rows at a time as there are cores, each with one thread, which
-    docs/training.md finds faster than one after the other; on a GPU, one.
+    Rows run side by side, which docs/training.md finds faster than one after the other.
     """
-    from pipeline.__main__ import main as run_main
-    from pipeline.plan import split_config
-    from stages.graphics.device import choose_device
     from stages.renderformer.s06_train import cost
 
-    jobs = jobs_of(table, names, overrides)
+    jobs = jobs_of(order.table, order.rows, order.overrides)
     costs = {}
     for name, job in jobs.items():
         configs = {stage: planned.config for stage, planned in job.plan.items()}
         costs[name] = cost(configs["train"], configs)
     # the dearest first, so that the last ones fill the gaps
-    order = sorted(jobs, key=lambda name: -getattr(costs[name], "days", 0))
-    at_once = []
-    if not any(word.startswith("jobs=") for word in overrides):
-        at_once = ["jobs=1" if choose_device("auto", "") == "cuda" else f"jobs={min(len(jobs), os.cpu_count() or 1)}"]
-    status = run_main([*words(table, order), *overrides, *at_once, "-m"])
-    if split_config(next(iter(jobs.values())).root)[0].plan:
+    dearest_first = sorted(jobs, key=lambda name: -getattr(costs[name], "days", 0))
+    status = table_of(order.table).make(dearest_first, order.overrides, len(jobs))
+    if only_planned(jobs.items()):
         known_costs = [estimate for estimate in costs.values() if estimate]
         print(
             f"in all: {len(known_costs)} rows, {sum(estimate.flops for estimate in known_costs):.2e} FLOPs of training, "
             f"{sum(estimate.days for estimate in known_costs):.3g} days of one A100"
         )
         return status
-    return status if status == INTERRUPTED else max(status, write_table(table, names, overrides, out))
+    return status if status == INTERRUPTED else max(status, write_table(order.table, order.rows, order.overrides, order.out))
 
 
 # --- what the store holds -----------------------------------------------------------------------------------------------------
@@ -147,8 +128,8 @@ class Result:
     evaluated: Artifact
 
 
-def load(job: Job, store: Store) -> Result | None:
-    evaluated, train = (store.find(stage, job.plan[stage].key) for stage in ("evaluate", "train"))
+def load(job: Job) -> Result | None:
+    evaluated, train = (made(job, stage) for stage in ("evaluate", "train"))
     if evaluated is None:
         return None
     log = train.file("log.jsonl").read_text().splitlines() if train is not None else []
@@ -230,12 +211,8 @@ def settings(job: Job, full: Job | None, result: Result | None) -> dict[str, str
 
 def gather(table: str, jobs: Mapping[str, Job]) -> dict[str, Any]:
     """Everything that the table says, as plain JSON."""
-    from pipeline.plan import split_config
-    from pipeline.store import Store
-
     first = next(iter(jobs.values()))
-    store = Store(split_config(first.root)[0].store)
-    results = {name: load(job, store) for name, job in jobs.items()}
+    results = {name: load(job) for name, job in jobs.items()}
     base = results.get(BASE)
     some = next((result for result in results.values() if result), None)
     rows = []
@@ -280,19 +257,16 @@ def gather(table: str, jobs: Mapping[str, Job]) -> dict[str, Any]:
 # --- the table ----------------------------------------------------------------------------------------------------------------
 
 
-def write_table(table: str, names: Sequence[str] | None, overrides: Sequence[str], out: Path) -> int:
+def write_table(table: str, rows: Sequence[str] | None, overrides: Sequence[str], out: Path) -> int:
     """Write table.md, table.json and table.png into ``out``; 1 if a row that was asked for is not in the store."""
-    jobs = jobs_of(table, names, overrides)
+    jobs = jobs_of(table, rows, overrides)
     numbers = gather(table, jobs)
     out.mkdir(parents=True, exist_ok=True)
     write_atomic(out / "table.json", (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode())
     write_atomic(out / "table.md", markdown(numbers).encode())
     draw(numbers, out / "table.png")
-    lacking = [row["name"] for row in numbers["rows"] if row["name"] in jobs and "ours" not in row]
-    if lacking:
-        print(f"not in the store: {', '.join(lacking)} (lightmill sweep {table} makes what is missing)")
     print(out / "table.md")
-    return int(bool(lacking))
+    return table_of(table).tell_missing([row["name"] for row in numbers["rows"] if row["name"] in jobs and "ours" not in row])
 
 
 def _format(metric: str, value: float | None, sign: str = "") -> str:
