@@ -51,6 +51,8 @@ def load_config(path: Path) -> Any:
         data = json.loads(path.read_text(encoding="utf-8-sig"))  # some editors begin a file with a byte order mark
     except FileNotFoundError:
         raise InputError(f"{path} is missing: a checkpoint folder holds config.json and model.safetensors") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} {wrong_kind(path) or 'is not JSON: it is no text in UTF-8'}") from None
     except ValueError as error:
         raise InputError(f"{path} {wrong_kind(path) or f'is not JSON: {error}'}") from None
     if not isinstance(data, dict):

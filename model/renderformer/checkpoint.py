@@ -68,6 +68,25 @@ def _check_shapes(config: Any, stored: Mapping[str, tuple[int, ...]], path: Path
         raise InputError(f"{path}: {CONFIG} asks for other shapes: {_some(wrong)}")
 
 
+def _check_values(state: Mapping[str, Tensor], path: Path) -> None:
+    """That all are numbers of floating point."""
+    whole = [
+        f"{name} of {str(tensor.dtype).removeprefix('torch.')}"
+        for name, tensor in state.items()
+        if not tensor.is_floating_point()
+    ]
+    if whole:
+        raise InputError(f"{path} holds other numbers than weights are: {_some(whole)}; convert them to float32")
+
+
+def _damage(path: Path, error: SafetensorError) -> str:
+    """What is wrong with a file that has no known kind."""
+    size = path.stat().st_size
+    if "not fully covered" in str(error):
+        return f"is not a safetensors file as it was: it is cut off or has bytes too many ({size:,}), fetch it again"
+    return f"is not a safetensors file, or a damaged one ({size:,} bytes): fetch it again"
+
+
 def _some(names: Collection[str]) -> str:
     """Three of the names, and how many more there are."""
     first = ", ".join(sorted(names)[:NAMED])
@@ -107,7 +126,8 @@ def load(folder: Path, say: Callable[[str], None] = _say) -> tuple[Network, dict
             _check_shapes(config, stored, path)
             state = {name.removeprefix(prefix): file.get_tensor(name) for name in names}
     except SafetensorError as error:
-        raise InputError(f"{path} {wrong_kind(path) or f'is not a safetensors file: {error}'}") from None
+        raise InputError(f"{path} {wrong_kind(path) or _damage(path, error)}") from None
+    _check_values(state, path)
     if prefix:
         say(f"{path}: all names begin with {prefix!r}, as a wrapper around the network left them; it is taken off")
     model = build(config)

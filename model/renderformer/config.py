@@ -35,6 +35,29 @@ FIXED: dict[str, Any] = {
 }
 
 
+KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", tuple: "a list of whole numbers"}
+
+
+def check_types(config: type, data: dict[str, Any], where: str) -> None:
+    """InputError where a value of a ``config.json`` is of another type than that field's default.
+
+    A field without a plain default is passed over; one whose default is None takes a list of whole numbers as well.
+    """
+    for entry in dataclasses.fields(config):
+        if entry.default is dataclasses.MISSING or entry.name in FIXED:
+            continue
+        kind, value = tuple if entry.default is None else type(entry.default), data[entry.name]
+        if value is None and entry.default is None:
+            continue
+        fits = (
+            isinstance(value, list | tuple) and all(type(item) is int for item in value)
+            if kind is tuple
+            else (type(value) is kind or (kind is float and type(value) is int))
+        )
+        if not fits:
+            raise InputError(f"{where}: {entry.name} is {str(value)[:60]!r}, expected {KINDS[kind]}")
+
+
 @dataclass(frozen=True)
 class ModelConfig:
     """Widths, depths and switches of both stages. Unit of every ``*_dim`` is channels."""
@@ -179,6 +202,7 @@ class ModelConfig:
             raise InputError(f"{where}: unknown field {', '.join(unknown)}: this code would not compute what it means")
         if missing:
             raise InputError(f"{where}: field {', '.join(missing)} is missing: a released config.json names them all")
+        check_types(cls, data, where)
         values = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
         try:
             return cls(**values)

@@ -21,7 +21,7 @@ from stages.renderformer.inference.scene_files import load_scene
 from stages.renderformer.s00_collect import Collect
 from stages.renderformer.scenes import textures
 from tests.graphics import slow_gltf
-from tests.graphics.habits import BOX, HABITS, TRIANGLES, F, V
+from tests.graphics.habits import BOX, HABITS, QUADS, TRIANGLES, F, V
 from tests.graphics.malformed import MALFORMED, glb
 
 CLASSES = re.compile(r"\b\w*(?:Error|Exception|Warning)\b|Traceback|NoneType|object has no|not subscriptable")
@@ -350,6 +350,10 @@ OLDER = "KHR_materials_pbrSpecularGlossiness"
         ({PBR: {"baseColorFactor": [0.5, 0.5, 0.5, 1]}, "extensions": {OLDER: {"diffuseFactor": [0, 0, 1, 1]}}}, None, False,
          [0, 0, 1], None),
         ({"extensions": {OLDER: {}}}, None, False, [1, 1, 1], None),
+        ({"extensions": {OLDER: {"diffuseFactor": [0, 0, 0, 1], "specularFactor": [0.9, 0.7, 0.2]}}}, None, False,
+         [0.9, 0.7, 0.2], None),
+        ({PBR: {"baseColorFactor": [1, 0, 0, 0]}, "alphaMode": "BLEND"}, None, False, [1, 0, 0], "it is opaque here"),
+        ({PBR: {"baseColorFactor": [0, 0, 0, 1]}, "emissiveFactor": [1, 1, 0]}, None, False, [0, 0, 0], "it shines"),
         ({"extensions": {"KHR_materials_unlit": {}}, PBR: {"baseColorFactor": [0, 1, 0, 1]}}, None, False, [0, 1, 0], None),
         (None, RAMP.astype("<f4"), False, RAMP, None),
         (None, np.c_[RAMP, np.ones(8)].astype("<f4"), False, RAMP, None),
@@ -371,6 +375,52 @@ def test_gltf_colours(tmp_path: Path, material, colours, normalized, expected, n
         assert np.allclose(found, ends, atol=1e-4)
     assert (note in "".join(notes)) if note else not notes
     assert not any(CLASSES.search(line) for line in notes)
+
+
+PLY = """ply
+format ascii 1.0
+element vertex 8
+property float x
+property float y
+property float z
+{}element face 6
+property list uchar int vertex_indices
+end_header
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "names", "value"),
+    [
+        ("uchar", "red green blue", "255 0 0"), ("ushort", "red green blue", "65535 0 0"), ("float", "red green blue", "1 0 0"),
+        ("float", "red green blue", "255 0 0"), ("int", "red green blue", "255 0 0"), ("uchar", "r g b", "255 0 0"),
+        ("uchar", "diffuse_red diffuse_green diffuse_blue", "255 0 0"),
+    ],
+)  # fmt: skip
+def test_ply_colours_of_every_type_and_name(tmp_path: Path, kind: str, names: str, value: str) -> None:
+    header = PLY.format("".join(f"property {kind} {name}\n" for name in names.split()))
+    rows = [*(f"{x} {y} {z} {value}" for x, y, z in BOX), *("4 " + " ".join(map(str, quad)) for quad in QUADS)]
+    (tmp_path / "a.ply").write_text(header + "\n".join(rows))
+    found, notes = shown(tmp_path / "a.ply")
+    assert np.allclose(found, [1, 0, 0]) and not notes
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "reason", "words"),
+    [
+        ("a.ply", PLY.format("").replace("vertex 8", "vertex 9"), "unreadable", "line 23: 2 words after the last element"),
+        ("a.ply", PLY.format("").replace("face 6", "face 5"), "unreadable", "line 23: 5 words after the last element"),
+        ("a.ply", PLY.format("").replace("face 6", "face 0"), "unreadable", "30 words after the last element"),
+        ("a.obj", "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "unreadable", "a Git LFS pointer"),
+        ("a.glb", "<!DOCTYPE html>\n<html><body>Log in</body></html>", "unreadable", "an HTML page"),
+    ],
+)
+def test_what_does_not_fit_is_no_mesh(tmp_path: Path, name: str, data: str, reason: str, words: str) -> None:
+    rows = [*(f"{x} {y} {z}" for x, y, z in BOX), *("4 " + " ".join(map(str, quad)) for quad in QUADS)]
+    (tmp_path / name).write_text(data + "\n".join(rows) if name.endswith(".ply") else data)
+    with pytest.raises(Reject) as caught:
+        mesh_of(tmp_path / name)
+    assert caught.value.reason == reason and words in caught.value.detail
 
 
 LINEAR = 0.21586  # of the byte 128

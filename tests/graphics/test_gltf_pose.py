@@ -121,6 +121,15 @@ def test_instances_are_placed_and_counted(tmp_path: Path) -> None:
     assert caught.value.reason == "too_large"
 
 
+def test_hidden_nodes_are_not_drawn(tmp_path: Path) -> None:
+    made = Made()
+    hidden = {"extensions": {"KHR_node_visibility": {"visible": False}}, "children": [2]}
+    made.tree["nodes"] += [hidden, {"mesh": 0, "translation": [9, 0, 0]}]
+    assert same_points(made.read(tmp_path).vertices, BOX)
+    hidden["extensions"]["KHR_node_visibility"]["visible"] = True
+    assert len(made.read(tmp_path).faces) == 24
+
+
 def test_normals_turn_with_what_moves(tmp_path: Path) -> None:
     made = Made()
     made.primitive["attributes"] |= {

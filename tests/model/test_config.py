@@ -124,12 +124,23 @@ def test_strict_loading_names_what_is_wrong(tmp_path):
     save_file(state | {"tri_token": torch.zeros(1, 1, 64)}, folder / "model.safetensors")
     with pytest.raises(ValueError, match=r"tri_token has shape \(1, 1, 64\), not \(1, 1, 128\)"):
         checkpoint.load(folder)
+    folder, _, state = broken("whole numbers")
+    save_file({name: tensor.int() for name, tensor in state.items()}, folder / "model.safetensors")
+    with pytest.raises(ValueError, match="holds other numbers than weights are: .* of int32.*and .* more; convert"):
+        checkpoint.load(folder)
+    for value, words in (("128", "'128'"), (128.0, "'128.0'"), (True, "'True'"), (None, "'None'")):
+        folder, config, _ = broken(f"type {words}")
+        (folder / "config.json").write_text(json.dumps(config | {"latent_dim": value}))
+        with pytest.raises(ValueError, match=f"latent_dim is {words}, expected a whole number"):
+            checkpoint.load(folder)
     with pytest.raises(ValueError, match="config.json is missing"):
         checkpoint.load(tmp_path / "nowhere")
     folder, _, _ = broken("truncated")
-    (folder / "model.safetensors").write_bytes(b"123")
-    with pytest.raises(ValueError, match="not a safetensors file"):
-        checkpoint.load(folder)
+    whole = (folder / "model.safetensors").read_bytes()
+    for data, words in ((b"123", "or a damaged one"), (whole[:-40], "cut off or has bytes too many"), (whole[:99], "damaged")):
+        (folder / "model.safetensors").write_bytes(data)
+        with pytest.raises(ValueError, match=f"is not a safetensors file.*{words}.*fetch it again"):
+            checkpoint.load(folder)
 
 
 @pytest.fixture

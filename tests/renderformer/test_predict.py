@@ -430,6 +430,8 @@ def test_a_bad_scene_is_named_in_one_line(checkpoint, scene_json, tmp_path, caps
         ("scene.blend", b"", "in Blender, and choose File > Export > glTF"),
         ("scene.txt", b"", "neither a scene nor a mesh"),
         ("scene.json", b"{", "is not JSON"),
+        ("scene.json", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "is a Git LFS pointer"),
+        ("scene.h5", b"<!DOCTYPE html>", "is an HTML page"),
         ("scene.h5", b"\x89HDF", "is not an HDF5 file"),
     ],
 )

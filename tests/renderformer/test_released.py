@@ -160,6 +160,19 @@ def test_a_link_out_of_the_folder_is_refused(write):
         load_scene(path)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_byte_order_mark_is_read(write, encoding):
+    path = write(lambda scene: None)
+    plain = load_scene(path)
+    path.write_bytes(path.read_text(encoding="utf-8").encode(encoding))
+    assert (load_scene(path).triangles == plain.triangles).all()
+
+
+def test_what_lies_too_far_away_is_refused(write):
+    with pytest.raises(UserError, match=r"reaches 1e\+30 scene units, at most 1e\+12 are taken: scale it down"):
+        load_scene(write(set_in("objects", "square", "transform", {"scale": [1e30] * 3})))
+
+
 def test_other_files_are_refused(tmp_path):
     (tmp_path / "a.json").write_text("{")
     (tmp_path / "a.h5").write_text("no")

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from model.errors import InputError
+from model.renderformer.config import check_types
 
 ARCHITECTURE = "guided"
 # Channels that networks of any config have
@@ -107,6 +108,7 @@ class GuidedConfig:
             for problem, differing in (("unknown", set(given) - names), ("missing", names - set(given))):
                 if differing:
                     raise InputError(f"{where}: {problem} field {', '.join(prefix + name for name in sorted(differing))}")
+            check_types(kind, given, where)
         try:
             return cls(**{**data, "guide": GuideConfig(**guide)})
         except (TypeError, ValueError) as error:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from model.file_kinds import failed_download
 from pipeline.errors import Reject
 from stages.graphics.geometry import colours
 from stages.graphics.geometry.formats import dae, gltf_mesh, obj, off, ply, stl, threemf, usd
@@ -103,7 +104,10 @@ def read_parts(source: Source) -> list[Part]:
         size = path.stat().st_size
         if size > source.max_bytes:
             raise Reject("too_large", f"{size} bytes, at most {source.max_bytes} are read")
-        return [part for part in READERS[path.suffix.lower()](path.read_bytes(), source) if len(part.triangles)]
+        data = path.read_bytes()
+        if (failed := failed_download(data)) is not None:
+            raise Reject("unreadable", f"it {failed}")
+        return [part for part in READERS[path.suffix.lower()](data, source) if len(part.triangles)]
 
 
 def checked(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:

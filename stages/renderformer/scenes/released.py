@@ -18,7 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from model.file_kinds import failed_download
 from pipeline.errors import Reject, UserError
+from stages.graphics.geometry.load import LARGEST
 from stages.graphics.geometry.measure import face_normals, have_area
 from stages.renderformer.records import PATCH_CHANNELS, PATCH_KEPT, PATCH_SIDE, TEXTURED_CHANNELS, SceneRecord, patch_means
 from stages.renderformer.scenes.assemble import rotation_matrix
@@ -43,7 +45,18 @@ def load_scene(path: Path | str) -> SceneRecord:
     for name, values in scene.arrays().items():
         if not np.isfinite(values).all():
             raise UserError(f"{path}: {name} holds {np.size(values) - np.isfinite(values).sum()} values that are not finite")
+    farthest = max(float(np.abs(values).max(initial=0)) for values in (scene.triangles, scene.camera_to_world))
+    if farthest > LARGEST:
+        raise UserError(f"{path} reaches {farthest:.3g} scene units, at most {LARGEST:.0e} are taken: scale it down")
     return scene
+
+
+def _download(path: Path) -> str | None:
+    """What the file is where a download went wrong."""
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        return failed_download(file.read(512))
 
 
 # --- JSON -------------------------------------------------------------------------------------------------------------
@@ -54,11 +67,11 @@ def load_json(path: Path) -> SceneRecord:
     try:
         if path.stat().st_size > MAX_JSON_BYTES:
             raise UserError(f"{path} has {path.stat().st_size:,} bytes: scenes of at most {MAX_JSON_BYTES:,} are read")
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_bytes())  # in UTF-8 or 16, with or without a byte order mark
     except UserError:
         raise
     except (ValueError, OSError, RecursionError) as error:
-        raise UserError(f"{path} is not JSON: {error}") from error
+        raise UserError(f"{path} {_download(path) or f'is not JSON: {error}'}") from error
     if not isinstance(data, dict) or not isinstance(data.get("objects"), dict) or not data["objects"]:
         raise UserError(f"{path} has no objects: expected objects {{name: {{mesh_path, material, transform}}}} and cameras")
     cameras = data.get("cameras")
@@ -268,7 +281,7 @@ def load_hdf5(path: Path) -> SceneRecord:
             texture = _dataset(file, "texture", path)
             aspects = np.atleast_1d(np.asarray(file["fov"].attrs.get("aspect", []), np.float64))
     except (OSError, RuntimeError, KeyError) as error:
-        raise UserError(f"{path} is not an HDF5 file that can be read ({error})") from error
+        raise UserError(f"{path} {_download(path) or f'is not an HDF5 file that can be read ({error})'}") from error
     patch_index, patches = None, None
     if texture.ndim == 4:
         texture, patch_index, patches = _patches(texture, path)

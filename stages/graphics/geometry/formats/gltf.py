@@ -7,7 +7,7 @@ Draco are settled there. It follows no link outside the root, and nothing is all
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from stages.graphics.geometry.paths import check_path
 BUFFER_SUFFIX = ".bin"  # files that a glTF may keep its buffers in
 # Extensions that a file may require and that change nothing about where its triangles are, or that are decoded here.
 INSTANCING = "EXT_mesh_gpu_instancing"
-HARMLESS = {draco.EXTENSION, "KHR_mesh_quantization", INSTANCING}
+HARMLESS = {draco.EXTENSION, "KHR_mesh_quantization", "KHR_node_visibility", INSTANCING}
 HARMLESS_PREFIXES = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_animation_", "KHR_xmp")
 DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}  # by componentType
 SHAPES = {  # (columns, rows) by type
@@ -219,10 +219,16 @@ class Gltf:
         The scene is the file's default one, else the first. A file without scenes shows all its nodes.
         """
         if not self.tree["scenes"]:
-            return self.walk(self.roots())
+            return self.walk(self.roots(), self._visible)
         number = integer(self.tree, "scene", 0)
         with at(f"scene {number}"):
-            return self.walk(integers(self.entry("scenes", number), "nodes"))
+            return self.walk(integers(self.entry("scenes", number), "nodes"), self._visible)
+
+    def _visible(self, index: int) -> bool:
+        """Whether a node and what is below it are drawn (KHR_node_visibility)."""
+        stated = self.entry("nodes", index).get("extensions")
+        hidden = stated.get("KHR_node_visibility") if isinstance(stated, dict) else None
+        return not isinstance(hidden, dict) or hidden.get("visible") is not False
 
     def roots(self) -> list[int]:
         """The nodes that are below no other."""
@@ -230,11 +236,13 @@ class Gltf:
         below = {child for node in nodes for child in node.get("children", [])}
         return [index for index in range(len(nodes)) if index not in below]
 
-    def walk(self, roots: list[int]) -> Iterator[tuple[int, np.ndarray]]:
-        """These nodes and all below them, parents first, and the (4, 4) matrix of each to the scene."""
+    def walk(self, roots: list[int], drawn: Callable[[int], bool] = lambda index: True) -> Iterator[tuple[int, np.ndarray]]:
+        """These nodes and all below them, parents first, each with its (4, 4) matrix to the scene; none below one not drawn."""
         queue = [(root, np.eye(4)) for root in dict.fromkeys(roots)]
         while queue:
             index, above = queue.pop()
+            if not drawn(index):
+                continue
             node = self.entry("nodes", index)
             with at(f"node {index}"):
                 matrix = above @ local_matrix(node)

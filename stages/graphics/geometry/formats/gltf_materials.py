@@ -77,6 +77,9 @@ def _material(gltf: Gltf, entry: dict[str, Any], place: str, source: Source) -> 
     if older is not None:
         base, name = table(optional(entry, "extensions"), OLDER), "diffuse"
     factor = floats(base, f"{name}Factor", 4, [1, 1, 1, 1])[:3]
+    if older is not None and not factor.any() and "specularFactor" in base:  # a metal, as this model has them
+        factor = floats(base, "specularFactor", 3)
+    _say_left_out(entry, place, source)
     colour = tuple(as_colour(factor, f"{place}: {name}Factor", source.note).tolist())
     if f"{name}Texture" not in base:
         return Material(colour, stated=True), 0
@@ -86,6 +89,14 @@ def _material(gltf: Gltf, entry: dict[str, Any], place: str, source: Source) -> 
     except Reject as reject:
         source.note(reject.detail)
         return Material(colour), 0
+
+
+def _say_left_out(entry: dict[str, Any], place: str, source: Source) -> None:
+    """What of a material a base colour cannot hold."""
+    if entry.get("alphaMode", "OPAQUE") != "OPAQUE":
+        source.note(f"{place}: it is see-through in places: it is opaque here")
+    if floats(entry, "emissiveFactor", 3, [0, 0, 0]).any():
+        source.note(f"{place}: it shines, and is drawn as a surface that does not")
 
 
 def textured(gltf: Gltf, texture: dict[str, Any], colour: tuple, source: Source) -> tuple[Material, int]:

@@ -75,7 +75,7 @@ def _read_map(entry: Entry, value: bytes) -> None:
                 entry.offset = u, v
             else:
                 entry.scale = u, v
-    entry.image = value.decode("utf-8", "replace").strip()
+    entry.image = value.decode("utf-8", "replace").strip().strip('"')
 
 
 def library_files(names: list[str], source: Source) -> list[str]:

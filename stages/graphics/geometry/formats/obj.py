@@ -14,6 +14,7 @@ from stages.graphics.geometry.formats.polygons import triangulate
 from stages.graphics.geometry.formats.text import floats, integers, plain_text, shown
 
 NUMBERS = (b"v", b"vt", b"vn")
+LEFT_OUT = {b"surf": "free-form surfaces", b"call": "other files that it calls"}
 
 
 @dataclass
@@ -42,8 +43,10 @@ class _Faces:
 
 def read(data: bytes, source: Source) -> list[Part]:
     """One part for each material, the last to be used first."""
-    lines, faces, libraries = _lines(data)
+    lines, faces, libraries, left_out = _lines(data)
     source.references += libraries
+    for number, what in left_out:
+        source.note(f"line {number}: {what} are left out")
     total = sum(len(group.values) for group in faces.values())
     if total > source.max_faces:
         raise Reject("too_large", f"{total} faces, at most {source.max_faces} are taken")
@@ -68,11 +71,12 @@ def library_names(data: bytes) -> list[str]:
     return _lines(data)[2]
 
 
-def _lines(data: bytes) -> tuple[dict[bytes, _Lines], dict[str | None, _Lines], list[str]]:
-    """Lines of numbers by key, of faces by material, and the names of material libraries."""
+def _lines(data: bytes) -> tuple[dict[bytes, _Lines], dict[str | None, _Lines], list[str], list[tuple[int, str]]]:
+    """Lines of numbers by key, of faces by material, the names of material libraries, and (line, what) is not read."""
     numbers = {key: _Lines() for key in NUMBERS}
     faces: dict[str | None, _Lines] = {}
     libraries: list[str] = []
+    left_out: dict[bytes, tuple[int, str]] = {}
     material = None
     for number, line in _joined(plain_text(data)):
         words = line.split(None, 1)
@@ -87,7 +91,9 @@ def _lines(data: bytes) -> tuple[dict[bytes, _Lines], dict[str | None, _Lines], 
             material = mtl.material_name(value)
         elif key == b"mtllib" and value:
             libraries.append(value.decode("utf-8", "replace").strip())
-    return numbers, faces, libraries
+        elif key in LEFT_OUT:
+            left_out.setdefault(key, (number, LEFT_OUT[key]))
+    return numbers, faces, libraries, list(left_out.values())
 
 
 def _joined(text: bytes):

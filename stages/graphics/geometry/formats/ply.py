@@ -21,6 +21,7 @@ TYPES = {
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 CORNERS = ("vertex_indices", "vertex_index")
 TEXTURE_COORDINATES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
+COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 MAX_HEADER = 1 << 16  # bytes
 
 
@@ -68,7 +69,7 @@ def read(data: bytes, source: Source) -> list[Part]:
     points = points_of(vertex)
     corners, sizes, owner_element = _corners(elements)
     if not len(sizes):
-        return []
+        raise Reject("no_faces", f"{vertex.count} vertices, no faces: a cloud of points")
     if header.texture:
         source.note(f"image {header.texture[:80]}: images of PLY files are not read")
     triangles, owner = triangulate(sizes, points_at(points, corners))
@@ -205,6 +206,8 @@ def _read_text(elements: list[Element], words: Words) -> None:
             start = end
         else:
             start = _read_text_lists(element, words, start)
+    if start < len(words):
+        raise Reject("unreadable", f"{words.place(start)}: {len(words) - start} words after the last element")
 
 
 def _read_text_lists(element: Element, words: Words, start: int) -> int:
@@ -395,11 +398,20 @@ def _look(vertex: Element, face: Element, corners: np.ndarray, owner: np.ndarray
 
 def _colours(element: Element, source: Source) -> np.ndarray | None:
     """(count, 3) linear colours of an element's rows, or None."""
-    for prefix in ("", "diffuse_"):
-        names = [prefix + name for name in ("red", "green", "blue")]
+    for names in COLOURS:
         if all(name in element.columns and name not in element.sizes for name in names):
             kinds = {property.name: property.dtype for property in element.properties}
-            most = [float(np.iinfo(kinds[name]).max) if kinds[name].kind in "iu" else 1.0 for name in names]
-            values = np.stack([element.columns[name] for name in names], axis=1).astype(np.float64) / most
+            columns = [_unit(element.columns[name], kinds[name]) for name in names]
+            values = np.stack(columns, axis=1)
             return srgb_colours(values, f"{element.name} colours", source.note)
     return None
+
+
+def _unit(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Colour values of one channel as float64: whole numbers by the largest of their type, those of four bytes by 255."""
+    values = values.astype(np.float64)
+    if dtype.kind == "f":
+        return values
+    if dtype.itemsize > 2:  # nobody has so many steps
+        return values / (255 if values.max(initial=0) < 256 else 65535)
+    return np.where(values < 0, values + 256**dtype.itemsize, values) / (256**dtype.itemsize - 1)  # signed ones are not meant

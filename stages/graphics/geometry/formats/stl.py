@@ -38,8 +38,8 @@ def _binary(data: bytes, count: int, source: Source) -> list[Part]:
     if count > source.max_faces:
         raise Reject("too_large", f"states {count} faces, at most {source.max_faces} are taken")
     blob = np.frombuffer(data, TRIANGLE, count, HEADER)
-    if blob["attribute"].any():
-        source.note("colours in attribute bytes, an extension of some vendors, are not read")
+    if blob["attribute"].any() or b"COLOR=" in data[:HEADER]:
+        source.note("colours in attribute bytes or the header, an extension of some vendors, are not read")
     points = blob["corners"].reshape(-1, 3).astype(np.float64)
     return [_part(points, lambda vertex: f"byte {HEADER + TRIANGLE.itemsize * (vertex // 3)}: triangle {vertex // 3}")]
 
