@@ -191,6 +191,16 @@ def test_specular_reflectance_of_the_extensions(tmp_path):
     assert scene.specular[0] == pytest.approx(np.full(3, 0.5 / 9), rel=1e-5)
 
 
+def test_a_light_or_camera_that_is_nothing_is_left_out(tmp_path):
+    gltf = boxed()
+    gltf.tree["extensions"]["KHR_lights_punctual"]["lights"][0] |= {"type": "spot", "spot": {"outerConeAngle": 0.0}}
+    next(node for node in gltf.tree["nodes"] if node["name"] == "Camera")["scale"] = [0, 0, 0]
+    scene = imported(gltf, tmp_path)
+    assert scene.emission.max() > 0 and np.linalg.det(scene.camera_to_world[0, :3, :3]) == pytest.approx(1)
+    for words in ("'Lamp' has no strength", "'Camera' is scaled to nothing", "no light in the file", "no camera in the file"):
+        assert any(words in note for note in scene.meta["notes"])
+
+
 def test_a_scene_without_light_or_camera_gets_them(tmp_path):
     gltf = Gltf()
     gltf.node("Box", mesh=gltf.mesh("Box", trimesh.creation.box((1, 1, 1)), gltf.material("Plain")))

@@ -80,7 +80,7 @@ def converted(path: Path, described: Described, settings: ImportSettings) -> Sce
         f"{frame.scale:.4g}"
     )
     bodies = _bodies(described.parts, frame, notes)
-    lamps = [lamp for lamp in described.lamps if lamp.strength > 0 and lamp.colour.max() > 0]
+    lamps = [lamp for lamp in described.lamps if lamp.shines]
     if settings.triangles is not None:
         lit = bool(lamps) or any(part.surface.emits for part in described.parts)
         lamp_count = len(lamps) if lit else len(three_lights())
@@ -95,7 +95,7 @@ def converted(path: Path, described: Described, settings: ImportSettings) -> Sce
         triangle, radiance, note = lamp_triangle(lamp, frame, content)
         columns.add_light(lamp.name, triangle, radiance)
         notes.append(note)
-    dark = [lamp.name for lamp in described.lamps if not (lamp.strength > 0 and lamp.colour.max() > 0)]
+    dark = [lamp.name for lamp in described.lamps if not lamp.shines]
     notes += [f"light {name!r} has no strength: it is left out" for name in dark]
     if not columns.lights:
         notes.append("no light in the file: three white ones stand above, as in the default room")

@@ -82,16 +82,21 @@ class Lamp:
     direction: np.ndarray
     cone: tuple[float, float] = (0.0, np.pi / 4)
 
+    @property
+    def shines(self) -> bool:
+        """Whether any light leaves it."""
+        return self.strength > 0 and self.colour.max() > 0 and (self.kind != "spot" or self.cone[1] > 0)
+
 
 @dataclass
 class Viewpoint:
-    """A camera. pose: (4, 4) rigid camera-to-world, looks along -z with +y up. fov_deg: across the height.
+    """A camera. pose: (4, 4) rigid camera-to-world, looks along -z with +y up; None: nowhere. fov_deg: across the height.
 
     aspect: width over height. height: of what an orthographic camera sees, in the file's unit; None for a perspective one.
     """
 
     name: str
-    pose: np.ndarray
+    pose: np.ndarray | None
     fov_deg: float
     aspect: float = 1.0
     height: float | None = None
@@ -107,16 +112,29 @@ class Described:
     up: Literal["y", "z"] = "y"
     notes: list[str] = field(default_factory=list)
 
+    def add_camera(self, name: str, viewpoint: Viewpoint) -> None:
+        """Add a camera, unless it looks nowhere."""
+        if viewpoint.pose is None:
+            self.notes.append(f"camera {name!r} is scaled to nothing: it is left out")
+        else:
+            self.viewpoints.append(viewpoint)
+
     @property
     def lit(self) -> bool:
         return bool(self.lamps) or any(part.surface.emits for part in self.parts)
 
 
-def rigid(matrix: np.ndarray) -> np.ndarray:
-    """(4, 4) without scale, shear and mirroring: the same place and axes at right angles. For cameras, which have no size."""
-    back = matrix[:3, 2] / max(float(np.linalg.norm(matrix[:3, 2])), 1e-300)
-    right = np.cross(matrix[:3, 1], back)
-    right = right / max(float(np.linalg.norm(right)), 1e-300)
+def rigid(matrix: np.ndarray) -> np.ndarray | None:
+    """(4, 4) without scale, shear and mirroring: the same place and axes at right angles. For cameras, which have no size.
+
+    None where a scale of nothing has taken the axes away.
+    """
+    up, back = matrix[:3, 1], matrix[:3, 2]
+    right = np.cross(up, back)
+    lengths = [float(np.linalg.norm(axis)) for axis in (back, right)]
+    if min(lengths) < 1e-100:
+        return None
+    back, right = back / lengths[0], right / lengths[1]
     pose = np.eye(4)
     pose[:3] = np.stack([right, np.cross(back, right), back, matrix[:3, 3]], axis=1)
     return pose

@@ -36,6 +36,7 @@ from stages.renderformer.importing.described import (
 PUNCTUAL = "KHR_lights_punctual"
 # Properties of a material that have no counterpart, and what stands for them.
 REPLACED = {
+    "KHR_materials_diffuse_transmission": "it lets light through: it is opaque here",
     "KHR_materials_transmission": "it lets light through: it is opaque here",
     "KHR_materials_volume": "it has an inside: only its surface is drawn",
     "KHR_materials_clearcoat": "its clear coat is left out",
@@ -100,7 +101,8 @@ class _Reader:
         if "mesh" in node:
             described.parts += self.parts(name, integer(node, "mesh"), index, to_world)
         if "camera" in node:
-            described.viewpoints.append(self.viewpoint(name, one_of(self.gltf, "cameras", integer(node, "camera")), to_world))
+            stated = one_of(self.gltf, "cameras", integer(node, "camera"))
+            described.add_camera(name, self.viewpoint(name, stated, to_world))
         if PUNCTUAL in extensions:
             lights = items(table(table(self.tree, "extensions"), PUNCTUAL), "lights")
             number = integer(table(extensions, PUNCTUAL), "light")

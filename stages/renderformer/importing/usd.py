@@ -72,7 +72,7 @@ def read_usd(path: Path) -> Described:
         name = prim.GetName()
         camera = UsdGeom.Camera(prim)
         if camera:
-            described.viewpoints.append(_viewpoint(name, camera.GetCamera(time), matrix))
+            described.add_camera(name, _viewpoint(name, camera.GetCamera(time), matrix))
         elif prim.GetTypeName() in LIGHTS:
             LIGHTS[prim.GetTypeName()](_Light(name, prim, time, matrix), described)
         elif str(prim.GetTypeName()).startswith("DomeLight"):
