@@ -177,7 +177,7 @@ def write(order: Order) -> int:
     for table, files, rows in _orders(order):
         jobs = files.jobs(rows, order.overrides)
         if len(jobs) != len(rows):
-            raise UserError("a table is a sweep over its rows alone: give each override one value")
+            raise UserError("a table is a sweep over its rows alone: give each override one value, or a list in brackets")
         found = {row: result for row, job in jobs if (result := Made.of(job)) is not None}
         missing |= files.tell_missing([row for row in rows if row not in found])
         gathered = gather(table, found, dict(jobs))

@@ -85,7 +85,7 @@ def jobs_of(table: str, rows: Sequence[str] | None, overrides: Sequence[str]) ->
     """Row name -> its job, in the table's order; a UserError unless all of them read the same shards."""
     jobs = table_of(table).jobs(rows, overrides)
     if len({row for row, _ in jobs}) != len(jobs):
-        raise UserError("a table is a sweep over its rows alone: give each override one value")
+        raise UserError("a table is a sweep over its rows alone: give each override one value, or a list in brackets")
     table_of(table).one_artifact(jobs, "shard", "model")
     return dict(jobs)
 
