@@ -52,8 +52,20 @@ class Table:
         return [f"system={self.system}", f"stage={stage}", "experiment=" + ",".join(f"{self.name}/{row}" for row in rows)]
 
     def jobs(self, names: Sequence[str] | None, overrides: Sequence[str]) -> list[tuple[str, Job]]:
-        """The rows' names and jobs: one, or one for each value of what the overrides sweep, such as ``train.seed=0,1``."""
-        return [(row, job) for row in self.chosen(names) for job in expand([*self.words([row]), *overrides])]
+        """The rows' names and jobs: one, or one for each value of what the overrides sweep, such as ``train.seed=0,1``.
+
+        UserError where the overrides undo what tells two rows apart: a table would show one run as two.
+        """
+        jobs = [(row, job) for row in self.chosen(names) for job in expand([*self.words([row]), *overrides])]
+        rows: dict[tuple[str, ...], str] = {}
+        for row, job in jobs:
+            other = rows.setdefault(tuple(job.keys.values()), row)
+            if other != row:
+                raise UserError(
+                    f"with these overrides the rows {other} and {row} of {self.name} are the same run: "
+                    f"one of them replaces what the rows say ({', '.join(overrides)})"
+                )
+        return jobs
 
     def make(self, rows: Sequence[str], overrides: Sequence[str], jobs: int, until: str = "evaluate") -> int:
         """Make what is missing of the rows up to stage ``until``; returns the exit status.

@@ -11,10 +11,10 @@ from pipeline.store import Artifact, Store
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def run_pipeline(*words: str, timeout: float = 1200) -> str:
-    """What ``python -m pipeline`` prints; it must succeed."""
+def run_pipeline(*words: str, timeout: float = 1200, module: str = "pipeline") -> str:
+    """What ``python -m pipeline``, or another module, prints; it must succeed."""
     done = subprocess.run(
-        [sys.executable, "-m", "pipeline", *words], cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False
+        [sys.executable, "-m", module, *words], cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

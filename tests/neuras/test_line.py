@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,23 @@ def test_the_line_ends_with_a_report_that_says_where_the_page_is(line):
     assert {row.group for row in made.rows()} == {"test", "shift"}
     assert run(store, "stage=evaluate", *QUICK).count("up to date") == 6
     assert "equal to before" in run(store, "stage=evaluate", *QUICK, "force=evaluate", "workers=0")
+
+
+def test_rows_of_a_table_are_made_where_they_are_missing_and_end_on_its_page(line, tmp_path):
+    store, _ = line
+    small = [word for word in SMALL if not word.startswith("fit.codes")]
+    words = ["sweep", "table4", "-o", str(tmp_path), f"hydra.run.dir={tmp_path}/runs", *small, *QUICK, f"store={store}"]
+    output = run_pipeline(*words, module="stages.cli", timeout=900)
+    assert output.splitlines()[-1] == str(tmp_path / "report.html") and "sweep: 2 jobs share capture, scaffold, atlas" in output
+    (table,), store_ = json.loads((tmp_path / "report.json").read_text()), Store(store)
+    with_codes, without = table["rows"]
+    assert with_codes["ours"]["psnr"]["mean"] > 10 and with_codes["published"]["stored"] == 394
+    assert without["ours"]["stored"]["mean"] > with_codes["ours"]["stored"]["mean"] and without["gain"]["mean"] != 0
+    for row, codes in ((with_codes, 1024), (without, 0)):
+        fit = store_.by_key(store_.by_key(row["evaluate"]).manifest["preimage"]["inputs"]["fit"])
+        assert fit.manifest["config"]["codes"] == codes
+    again = run_pipeline(*words, module="stages.cli", timeout=900)
+    assert "running" not in again and again.splitlines()[-1] == str(tmp_path / "report.html")
 
 
 def test_other_steps_fit_anew_and_render_no_street(line):

@@ -151,5 +151,7 @@ def test_a_single_table_and_what_is_wrong_with_an_order(tmp_path, monkeypatch):
         tables.write(Order("paper", ["ours"], [], tmp_path))
     with pytest.raises(UserError, match="row no is unknown: choose from with_vq, without_vq"):
         tables.write(Order("table4", ["no"], [], tmp_path))
+    with pytest.raises(UserError, match="rows with_vq and without_vq of table4 are the same run.*fit.codes=64"):
+        tables.write(Order("table4", None, ["fit.codes=64"], tmp_path))
     with pytest.raises(UserError, match="one value"):
         tables.write(Order("table4", None, ["fit.steps=1,2"], tmp_path))
