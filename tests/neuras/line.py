@@ -98,7 +98,7 @@ SYSTEM = System(
         "capture": "tests.neuras.line:Capture",
         "atlas": "tests.neuras.line:Atlas",
         "fit": "tests.neuras.line:Fit",
-        "bake": "stages.neuras.s04_bake:Bake",
-        "evaluate": "stages.neuras.s05_evaluate:Evaluate",
+        "bake": "stages.neuras.s05_bake:Bake",
+        "evaluate": "stages.neuras.s06_evaluate:Evaluate",
     },
 )

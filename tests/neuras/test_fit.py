@@ -25,7 +25,7 @@ from stages.graphics.casting import Caster
 from stages.graphics.page import png
 from stages.neuras.evaluation.renderers import Reference
 from stages.neuras.records import FRAME, CaptureInfo, FrameRecord, save
-from stages.neuras.s03_fit import Fit, FitStageConfig
+from stages.neuras.s04_fit import Fit, FitStageConfig
 from tests.model.lpips import write_weights
 from tests.neuras import scenes
 

@@ -1,8 +1,9 @@
 """Stage fit: textures, skyboxes, codebooks and both networks, learned once per scene (sections 3.1 to 3.3).
 
 Reads capture's training and validation frames and the atlas; writes ``model.safetensors`` and ``model.json`` (``Baked``),
-``curve.csv`` and ``curve.png``, ``validation/`` (truth above, ours below) and ``tensorboard/``. What each pixel
-sees of the mesh is cast anew in a run that goes on: 0.05 CPU-s a frame. The loop is ``model.neuras.fitting.fit``.
+``poses.json`` (of the training cameras that *refine* moved), ``curve.csv`` and ``curve.png``, ``validation/`` (truth above,
+ours below) and ``tensorboard/``. What each pixel sees of the mesh is cast anew in a run that goes on: 0.05 CPU-s a frame.
+The loop is ``model.neuras.fitting.fit``.
 """
 
 from __future__ import annotations
@@ -108,8 +109,8 @@ class FitStageConfig(StageConfig):
 
 class Fit(RunStage):
     name: ClassVar[str] = "fit"
-    version: ClassVar[int] = 3
-    inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas")
+    version: ClassVar[int] = 4
+    inputs: ClassVar[dict[str, str]] = {"capture": "capture", "scaffold": "refine", "atlas": "atlas"}
     Config: ClassVar[Any] = FitStageConfig
 
     def slug(self, config: FitStageConfig) -> str:
@@ -127,7 +128,7 @@ class Fit(RunStage):
 
         from model.neuras.fitting import Outputs, fit
         from stages.graphics.casting import Caster
-        from stages.neuras.records import CaptureInfo, frames, load_atlas
+        from stages.neuras.records import POSES, CaptureInfo, frames, load_atlas, posed, refined_poses, save_poses
 
         if config.threads is not None:
             torch.set_num_threads(config.threads)
@@ -135,7 +136,8 @@ class Fit(RunStage):
         info = CaptureInfo.of(inputs["capture"])
         atlas = load_atlas(inputs["atlas"].file("atlas.npz"))
         caster = Caster(atlas.vertices, atlas.faces)
-        training = [_view(frame, atlas, caster) for frame in frames(inputs["capture"], "train")]
+        poses = refined_poses(inputs["scaffold"])
+        training = [_view(frame, atlas, caster) for frame in posed(frames(inputs["capture"], "train"), poses)]
         validation = [_view(frame, atlas, caster) for frame in frames(inputs["capture"], "validation")]
         if not training:
             raise UserError("the capture has no training frame: look at its split")
@@ -149,10 +151,11 @@ class Fit(RunStage):
         device = choose_device(config.device, "fit.device")
         baked, summary = fit(config.fit(info.metre), surroundings, training, validation, outputs, device)
         baked.save(draft.files)
+        save_poses(draft.files, poses)
         rows = [json.loads(line) for line in (draft.state / "log.jsonl").read_text().splitlines()]
         _write_curve(rows, draft.files)
         draft.note("fitting", summary)
-        return ["model.json", "model.safetensors"]
+        return ["model.json", "model.safetensors", POSES]
 
 
 def _view(frame: FrameRecord, atlas: AtlasMesh, caster: Any) -> View:
