@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from stages.neuras.records import AtlasMesh, CaptureInfo, FrameRecord
 
 VGG_LEAST = 16  # pixels along a patch: VGG16 halves it four times
+SKY_STEP, SKY_MOST = 64, 512  # texels: a face spans two focal lengths, and a device keeps 36 faces
 REACH = 3.0  # texels of a level around a chart that a sample may read
 
 
@@ -45,7 +46,7 @@ class FitStageConfig(StageConfig):
     codes: int = Field(1024, ge=0, le=65536)  # K of each codebook; 0: no quantization
     skyboxes: int = Field(6, ge=1, le=16)  # L
     texture_levels: int = Field(3, ge=1, le=5)  # of the mesh's texture, each half as wide and high; 1: the paper's
-    sky_side: int = Field(256, ge=8, le=8192)  # texels along a face of a skybox
+    sky_side: int | None = Field(None, ge=8, le=8192)  # texels along a face of a skybox; null: one per two pixels, at most 512
     sky_near_m: float = Field(150.0, gt=0)  # half size of the nearest skybox
     sky_far_m: float = Field(2400.0, gt=0)
     # Optimization
@@ -95,8 +96,8 @@ class FitStageConfig(StageConfig):
                 )
         return self
 
-    def fit(self, metre: float) -> FitConfig:
-        """The loop's part: the fields of the same names, lengths in world units."""
+    def fit(self, metre: float, focal: float) -> FitConfig:
+        """The loop's part: the fields of the same names, lengths in world units. focal: of the photos, in pixels."""
         import dataclasses
 
         from model.neuras.scene import FitConfig, ShaderConfig
@@ -104,7 +105,9 @@ class FitStageConfig(StageConfig):
         def those_of(kind: Any) -> dict[str, Any]:
             return {f.name: getattr(self, f.name) for f in dataclasses.fields(kind) if f.name in type(self).model_fields}
 
-        return FitConfig(shader=ShaderConfig(**those_of(ShaderConfig)), voxel=self.voxel_m * metre, **those_of(FitConfig))
+        side = min(max(round(focal / SKY_STEP), 1) * SKY_STEP, SKY_MOST) if self.sky_side is None else self.sky_side
+        fields = those_of(FitConfig) | {"sky_side": side, "voxel": self.voxel_m * metre}
+        return FitConfig(shader=ShaderConfig(**those_of(ShaderConfig)), **fields)
 
 
 class Fit(RunStage):
@@ -124,6 +127,7 @@ class Fit(RunStage):
         return {"vgg16": hash_file(vgg_file(config.lpips_folder))} if config.perceptual_network == "vgg" else {}
 
     def run(self, config: FitStageConfig, inputs: Inputs, draft: Draft) -> list[str]:
+        import numpy as np
         import torch
 
         from model.neuras.fitting import Outputs, fit
@@ -137,7 +141,8 @@ class Fit(RunStage):
         atlas = load_atlas(inputs["atlas"].file("atlas.npz"))
         caster = Caster(atlas.vertices, atlas.faces)
         poses = refined_poses(inputs["scaffold"])
-        training = [_view(frame, atlas, caster) for frame in posed(frames(inputs["capture"], "train"), poses)]
+        photos = list(posed(frames(inputs["capture"], "train"), poses))
+        training = [_view(frame, atlas, caster) for frame in photos]
         validation = [_view(frame, atlas, caster) for frame in frames(inputs["capture"], "validation")]
         if not training:
             raise UserError("the capture has no training frame: look at its split")
@@ -149,7 +154,8 @@ class Fit(RunStage):
         )
         surroundings = _surroundings(config, info, atlas, [view.origin for view in training + validation])
         device = choose_device(config.device, "fit.device")
-        baked, summary = fit(config.fit(info.metre), surroundings, training, validation, outputs, device)
+        fitting = config.fit(info.metre, float(np.median([photo.camera.fx for photo in photos])))
+        baked, summary = fit(fitting, surroundings, training, validation, outputs, device)
         baked.save(draft.files)
         save_poses(draft.files, poses)
         rows = [json.loads(line) for line in (draft.state / "log.jsonl").read_text().splitlines()]

@@ -235,6 +235,18 @@ def test_exposure_is_found_on_the_left_half_and_scored_on_the_right(run):
     assert "found on its left half" not in (plain["evaluate"].path / "files/report.html").read_text()
 
 
+def test_a_view_is_aligned_on_the_left_half_and_scored_on_the_right(run):
+    turned = {"capture": {"turned": 0.02}, "fit": {"error": 0.0}}
+    plain, _ = run(**turned)
+    artifacts, _ = run(**turned, evaluate=QUICK | {"poses": "half"})
+    before = views_of(plain["evaluate"])
+    for id, row in views_of(artifacts["evaluate"]).items():
+        if row["split"] == "test":
+            assert row["counted"] == 0.5 and row["scores"]["ours"]["psnr"] > before[id]["scores"]["ours"]["psnr"] + 3
+    assert "turned and shifted" in (artifacts["evaluate"].path / "files/report.html").read_text()
+    assert "turned and shifted" not in (plain["evaluate"].path / "files/report.html").read_text()
+
+
 def test_without_opengl_and_browser_the_report_says_what_is_missing(run, no_opengl, monkeypatch):
     monkeypatch.setattr("stages.graphics.browser.find_browser", lambda: None)
     artifacts, _ = run(evaluate={**QUICK, "video_frames": 2, "page_views": 2, "depth_tolerance": 0.06})
