@@ -25,15 +25,16 @@ if TYPE_CHECKING:
 class RefineConfig(StageConfig):
     """Offsets and motions are measured in pixels of the nearest camera."""
 
-    vertices: bool = True  # they move along their normals
+    vertices: bool = False  # they move along their normals
     cameras: bool = True  # they turn and shift
-    blurs: tuple[float, ...] = Field((4.0, 2.0, 1.0), min_length=1)  # sigma of each level, coarse to fine
-    rounds: int = Field(3, ge=1)  # steps of each level
+    blurs: tuple[float, ...] = Field((1.5, 1.0), min_length=1)  # sigma of each level, coarse to fine
+    rounds: int = Field(4, ge=1)  # steps of each level
     neighbours: int = Field(4, ge=1)  # nearest photos that a photo is compared with
     stride: int = Field(2, ge=1)  # pixels from sample to sample
     smoothness: float = Field(1.0, ge=0)  # weight of what neighbouring vertices' offsets differ by
     closeness: float = Field(0.02, gt=0)  # weight of offsets
-    camera_closeness: float = Field(0.003, gt=0)  # weight of motions, against what the photos weigh
+    camera_closeness: float = Field(0.003, gt=0)  # weight of motions
+    least_gain: float = Field(0.01, ge=0, lt=1)  # share of the difference that must go, or nothing moves
 
     def settings(self) -> Settings:
         from stages.neuras.surfaces.photometric import Settings

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from pipeline.store import Store
-from stages.neuras.records import CaptureInfo, frames, load_atlas, scaffold_mesh
+from stages.neuras.records import CaptureInfo, frames, load_atlas, refined_poses, scaffold_mesh
 from tests.neuras.processes import artifact, run_pipeline
 
 SMALL = [
@@ -42,7 +42,8 @@ def test_from_nothing_to_a_page(line):
     assert CaptureInfo.of(capture).units == "metre"
     mesh, atlas = scaffold_mesh(artifact(store, "scaffold")), load_atlas(artifact(store, "atlas").file("atlas.npz"))
     refined = scaffold_mesh(artifact(store, "refine"))
-    assert np.array_equal(mesh.faces, refined.faces) and not np.array_equal(mesh.vertices, refined.vertices)
+    assert np.array_equal(mesh.vertices, refined.vertices) and np.array_equal(mesh.faces, refined.faces)
+    assert set(refined_poses(artifact(store, "refine"))) == {view.id for view in views if view.split == "train"}
     assert 500 < len(mesh.faces) <= 4100 and len(atlas.faces) == len(mesh.faces)
     site = artifact(store, "bake").path / "files" / "site"
     assert {"index.html", "viewer.js", "scene.json", "geometry.glb", "mesh_codes.png"} <= {path.name for path in site.iterdir()}

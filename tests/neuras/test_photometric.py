@@ -14,7 +14,7 @@ from stages.neuras.surfaces import photometric
 from stages.neuras.surfaces.photometric import Photo, Settings
 
 POSITIONS = [(-0.8, -0.6, 4.0), (0.0, -0.8, 4.1), (0.8, -0.6, 4.0), (-0.5, 0.7, 4.0), (0.6, 0.6, 4.2)]
-SETTINGS = Settings(blurs=(2.0, 1.0), rounds=3, stride=1, smoothness=3.0, closeness=0.01)
+SETTINGS = Settings(vertices=True, blurs=(2.0, 1.0), rounds=3, stride=1, smoothness=3.0, closeness=0.01)
 
 
 def hills(side: int = 25) -> Mesh:
@@ -85,9 +85,17 @@ def test_a_bump_that_the_photos_lack_goes(truth):
 
 def test_the_true_surface_stays(truth):
     mesh, photos = truth
-    found, cameras = photometric.refine(mesh, photos, SETTINGS)
+    found, cameras = photometric.refine(mesh, photos, replace(SETTINGS, least_gain=0.0))
     assert errors(found, mesh) < 0.004
     assert off(cameras, photos, mesh.vertices.astype(float)) < 0.1
+
+
+def test_where_nothing_is_to_be_gained_nothing_moves(truth):
+    mesh, photos = truth
+    lines = []
+    found, cameras = photometric.refine(mesh, photos, replace(SETTINGS, rounds=1, least_gain=0.5), lines.append)
+    assert found is mesh and all(camera is photo.camera for camera, photo in zip(cameras, photos, strict=True))
+    assert "nothing is moved" in lines[-1]
 
 
 def test_shaken_cameras_agree_again(truth):
