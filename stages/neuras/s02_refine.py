@@ -27,8 +27,8 @@ class RefineConfig(StageConfig):
 
     vertices: bool = False  # they move along their normals
     cameras: bool = True  # they turn and shift
-    blurs: tuple[float, ...] = Field((1.5, 1.0), min_length=1)  # sigma of each level, coarse to fine
-    rounds: int = Field(4, ge=1)  # steps of each level
+    blurs: tuple[float, ...] = Field((4.0, 2.0, 1.0), min_length=1)  # sigma of each level, coarse to fine
+    rounds: int = Field(3, ge=1)  # steps of each level
     neighbours: int = Field(4, ge=1)  # nearest photos that a photo is compared with
     stride: int = Field(2, ge=1)  # pixels from sample to sample
     smoothness: float = Field(1.0, ge=0)  # weight of what neighbouring vertices' offsets differ by

@@ -9,6 +9,7 @@ The loop is ``model.neuras.fitting.fit``.
 from __future__ import annotations
 
 import json
+import statistics
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -127,7 +128,6 @@ class Fit(RunStage):
         return {"vgg16": hash_file(vgg_file(config.lpips_folder))} if config.perceptual_network == "vgg" else {}
 
     def run(self, config: FitStageConfig, inputs: Inputs, draft: Draft) -> list[str]:
-        import numpy as np
         import torch
 
         from model.neuras.fitting import Outputs, fit
@@ -154,7 +154,7 @@ class Fit(RunStage):
         )
         surroundings = _surroundings(config, info, atlas, [view.origin for view in training + validation])
         device = choose_device(config.device, "fit.device")
-        fitting = config.fit(info.metre, float(np.median([photo.camera.fx for photo in photos])))
+        fitting = config.fit(info.metre, focal_length(photos))
         baked, summary = fit(fitting, surroundings, training, validation, outputs, device)
         baked.save(draft.files)
         save_poses(draft.files, poses)
@@ -162,6 +162,11 @@ class Fit(RunStage):
         _write_curve(rows, draft.files)
         draft.note("fitting", summary)
         return ["model.json", "model.safetensors", POSES]
+
+
+def focal_length(photos: Iterable[FrameRecord]) -> float:
+    """The median, in pixels."""
+    return statistics.median(photo.camera.fx for photo in photos)
 
 
 def _view(frame: FrameRecord, atlas: AtlasMesh, caster: Any) -> View:

@@ -53,8 +53,8 @@ class Settings:
 
     vertices: bool = False
     cameras: bool = True
-    blurs: tuple[float, ...] = (1.5, 1.0)
-    rounds: int = 4
+    blurs: tuple[float, ...] = (4.0, 2.0, 1.0)
+    rounds: int = 3
     neighbours: int = 4
     stride: int = 2
     smoothness: float = 1.0
