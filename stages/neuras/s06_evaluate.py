@@ -153,7 +153,7 @@ class Evaluate(MapStage):
             return draft.read(frame, (f"{name}.png",)).members[f"{name}.png"]
 
         if config.inception:
-            summary["distributions"] = _distributions(config, scene, inputs["capture"], summary, picture)
+            summary["distributions"] = _distributions(config, scene, inputs, summary, picture)
         write_json(draft.files / "metrics.json", summary)
         write_json(draft.files / "timing.json", timing)
         html = report.page(about, summary, timing, missing, clips, picture)
@@ -171,7 +171,7 @@ class Evaluate(MapStage):
 def _distributions(
     config: EvaluateConfig,
     scene: Scene,
-    capture: Artifact,
+    inputs: Inputs,
     summary: dict[str, Any],
     picture: Callable[[str, str], bytes],
 ) -> list[dict[str, Any]]:
@@ -182,8 +182,8 @@ def _distributions(
     sets, pictures = distributions.photographed(summary["groups"], picture)
     if not sets:
         along = [split for split in config.splits if split != "shift"]
-        sets, pictures = distributions.imagined(scene, capture, along, config.shifts_m, config.warping_views)
-    photos = (frame.image() for frame in frames(capture, "train", "validation", "test"))
+        sets, pictures = distributions.imagined(scene, inputs, along, config.shifts_m, config.warping_views)
+    photos = (frame.image() for frame in frames(inputs["capture"], "train", "validation", "test"))
     return distributions.judge(sets, pictures, photos, config.inception_folder)
 
 
