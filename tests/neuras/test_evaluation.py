@@ -75,7 +75,7 @@ def noisy(seed: int = 0, sigma: float = 8) -> tuple[np.ndarray, np.ndarray]:
 
 def test_without_a_mask_the_scores_are_those_of_the_whole_picture():
     photo, other = noisy()
-    found = scores.score(photo, other, np.ones((40, 60), bool), scores.scorers("none", None))
+    found = scores.score(photo, other, np.ones((40, 60), bool), scores.scorers((), None))
     assert found["mse"] == pytest.approx(np.mean((photo / 255 - other / 255) ** 2), abs=1e-6)
     assert found["psnr"] == pytest.approx(-10 * np.log10(np.mean((photo / 255 - other / 255) ** 2)), abs=1e-4)
     assert found["ssim"] == pytest.approx(metrics.ssim(photo / 255, other / 255), abs=1e-6)
@@ -87,7 +87,7 @@ def test_what_a_mask_leaves_out_changes_no_score():
     counts[:, 20:] = False
     black = other.copy()
     black[~counts] = 0
-    known = scores.scorers("none", None)
+    known = scores.scorers((), None)
     assert scores.score(photo, other, counts, known) == scores.score(photo, black, counts, known)
     assert scores.score(photo, other, counts, known) != scores.score(photo, other, np.ones_like(counts), known)
     wrong = other.copy()
