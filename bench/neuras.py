@@ -47,7 +47,7 @@ from pipeline.config import parse
 from pipeline.store import Artifact, Store
 from stages.graphics import browser
 from stages.graphics.casting import Caster
-from stages.neuras import s03_fit
+from stages.neuras import s04_fit
 from stages.neuras.baking import site
 from stages.neuras.baking.browser import pictures
 from stages.neuras.baking.drawing import depth_range
@@ -55,7 +55,7 @@ from stages.neuras.evaluation import costs
 from stages.neuras.evaluation.drive import scene_of
 from stages.neuras.evaluation.paths import framed
 from stages.neuras.evaluation.renderers import Scene
-from stages.neuras.records import frames
+from stages.neuras.records import fitted_poses, frames, posed
 
 SIZES = ((640, 360), (1280, 720), (1920, 1080))
 LAYERS = (1, 3, 6)
@@ -72,8 +72,8 @@ class Bench:
         inputs = store.resolve(reference).manifest["preimage"]["inputs"]
         fit = store.by_key(inputs["fit"])
         assert isinstance(fit, Artifact)
-        self.config = parse(s03_fit.FitStageConfig, fit.manifest["config"], "fit")
-        self.views = list(frames(self.capture))
+        self.config = parse(s04_fit.FitStageConfig, fit.manifest["config"], "fit")
+        self.views = list(posed(frames(self.capture), fitted_poses(fit)))
 
     @functools.cached_property
     def caster(self) -> Caster:
@@ -84,10 +84,11 @@ class Bench:
         torch.set_num_threads(1)
         torch.set_flush_denormal(True)
         scene, config = self.scene, self.config
-        training = [s03_fit._view(view, scene.atlas, self.caster) for view in self.views if view.split == "train"]
-        around = s03_fit._surroundings(config, scene.info, scene.atlas, [view.camera.position for view in self.views])
+        photos = [view for view in self.views if view.split == "train"]
+        training = [s04_fit._view(view, scene.atlas, self.caster) for view in photos]
+        around = s04_fit._surroundings(config, scene.info, scene.atlas, [view.camera.position for view in self.views])
         pixels = Pixels(training, around.sky_centre, config.patch, torch.device("cpu"))
-        return fitting.Trainer(Learned(config.fit(scene.info.metre), around, pixels)), pixels
+        return fitting.Trainer(Learned(config.fit(scene.info.metre, s04_fit.focal_length(photos)), around, pixels)), pixels
 
     def batches(self, pixels: Pixels, count: int) -> Iterator[Any]:
         return pixels.patches(self.config.seed, self.config.patches, 0, count)
@@ -181,7 +182,7 @@ class Bench:
 
     def reach(self) -> tuple[Row, list[Row]]:
         trainer, pixels = self.trainer()
-        views = [s03_fit._view(view, self.scene.atlas, self.caster) for view in self.views if view.split == "validation"]
+        views = [s04_fit._view(view, self.scene.atlas, self.caster) for view in self.views if view.split == "validation"]
         held_out = Pixels(views, trainer.scene.surroundings.sky_centre, self.config.patch, torch.device("cpu"))
         quiet = fitting.Outputs(Path("."), lambda text: None)
         steps, spent, curve = self.config.steps, 0.0, []

@@ -59,7 +59,7 @@ NEURAS = (
     "fit.checkpoint_every=5", "fit.log_every=1", "fit.validate_every=13", "evaluate.video_frames=2", "evaluate.timing_frames=1",
     "evaluate.timing_size=[64,36]", "evaluate.page_views=1", "workers=2",
 )  # fmt: skip
-NEURAS_STAGES = ("capture", "scaffold", "atlas", "fit", "bake", "evaluate")
+NEURAS_STAGES = ("capture", "scaffold", "refine", "atlas", "fit", "bake", "evaluate")
 MEASURED = ("seconds", "scenes_per_s", "tokens_per_s", "memory_gb", "mfu")  # of a log row; all else must be equal
 MEASURED_FILES = ("log.jsonl", "timing.json", "report.html", "tensorboard/*")  # hold times; other files must be equal
 # Pattern of what appears -> at most so many of them are waited for.

@@ -38,8 +38,8 @@ stages.renderformer.dataset  stages.renderformer.scenes  stages.renderformer.obj
 stages.renderformer.views  stages.renderformer.guides  stages.renderformer.hub
 stages.renderformer.records
 stages.neuras.commands  stages.neuras.viewing
-stages.neuras.s02_atlas  stages.neuras.s03_fit  stages.neuras.s04_bake  stages.neuras.s05_evaluate
-stages.neuras.s00_capture  stages.neuras.s01_scaffold
+stages.neuras.s03_atlas  stages.neuras.s04_fit  stages.neuras.s05_bake  stages.neuras.s06_evaluate
+stages.neuras.s00_capture  stages.neuras.s01_scaffold  stages.neuras.s02_refine
 stages.neuras.evaluation
 stages.neuras.captures  stages.neuras.street  stages.neuras.surfaces  stages.neuras.baking
 stages.neuras.rasterizing

@@ -11,8 +11,8 @@ A capture's artifact holds *frame* records ("frame-..") and *points* records ("p
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +25,8 @@ from stages.graphics.arrays import pack_arrays, pack_json, unpack_arrays, unpack
 from stages.graphics.cameras import Camera
 
 FRAME, POINTS = "frame-", "points-"  # how the ids of a capture's records begin
+POSES = "poses.json"  # camera-to-world (4, 4) of moved cameras by their frames' ids
+Poses = Mapping[str, np.ndarray]
 Split = Literal["train", "validation", "test", "shift"]  # shift: beside the driven path, only where truth exists
 
 
@@ -144,6 +146,32 @@ def frames(capture: Artifact, *splits: Split) -> Iterator[FrameRecord]:
                 yield frame
 
 
+def posed(frames: Iterable[FrameRecord], poses: Poses) -> Iterator[FrameRecord]:
+    """The frames, with these cameras' poses where there are some."""
+    for frame in frames:
+        pose = poses.get(frame.id, frame.camera.camera_to_world)
+        yield replace(frame, camera=replace(frame.camera, camera_to_world=pose))
+
+
+def refined_poses(scaffold: Artifact) -> Poses:
+    """Of the training cameras that *refine* moved."""
+    return _poses(scaffold.read("mesh").members.get(POSES))
+
+
+def fitted_poses(fit: Artifact) -> Poses:
+    """Of the training cameras that a *fit* did not take as the capture has them."""
+    path = fit.path / "files" / POSES
+    return _poses(path.read_bytes() if path.exists() else None)
+
+
+def save_poses(folder: Path, poses: Poses) -> None:
+    (folder / POSES).write_bytes(pack_json({id: np.asarray(pose).tolist() for id, pose in poses.items()}))
+
+
+def _poses(data: bytes | None) -> Poses:
+    return {} if data is None else {id: np.array(pose, float) for id, pose in unpack_json(data).items()}
+
+
 def point_sets(capture: Artifact) -> Iterator[PointsRecord]:
     """All points records, in order of their ids."""
     for row in capture.rows():
@@ -201,7 +229,7 @@ def given_mesh(capture: Artifact) -> Mesh | None:
 
 
 def scaffold_mesh(scaffold: Artifact) -> Mesh:
-    """The mesh of a *scaffold* artifact."""
+    """The mesh of a *scaffold* or *refine* artifact."""
     return Mesh(**unpack_arrays(scaffold.read("mesh").members["mesh.npz"]))
 
 

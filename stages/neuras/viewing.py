@@ -119,4 +119,6 @@ def evaluated(shown: Shown) -> Iterator[Any]:
         yield capture_space(capture, scaffold_of(shown.store, capture), shown.record_id)
 
 
-VIEWS = Views(stages={"capture": captured, "scaffold": scaffolded, "atlas": unfolded, "evaluate": evaluated})
+VIEWS = Views(
+    stages={"capture": captured, "scaffold": scaffolded, "refine": scaffolded, "atlas": unfolded, "evaluate": evaluated}
+)

@@ -13,6 +13,7 @@ from pipeline.stage import Item, MapStage, RunStage, System
 from stages.graphics.arrays import pack_json
 from stages.neuras.evaluation.renderers import Reference, as_bytes
 from stages.neuras.records import CaptureInfo, FrameRecord, save
+from stages.neuras.surfaces.photometric import moved
 from tests.neuras import scenes
 
 PLACES = {  # split, shift and camera position, along an arc around the ball
@@ -36,6 +37,7 @@ def truth() -> Reference:
 class CaptureConfig(StageConfig):
     masked: bool = False  # the upper half of every frame does not count, and is white
     gain: float = 1.0  # of the photos' colours
+    turned: float = 0.0  # radians that the held-out frames' poses are off
 
 
 class Capture(MapStage):
@@ -55,8 +57,10 @@ class Capture(MapStage):
         if config.masked:
             picture[:32] = 255
             mask = encoded(np.repeat(np.arange(64)[:, None] >= 32, 96, axis=1).astype(np.uint8) * 255)
-        path = "drive" if split != "shift" else f"shift_{shift:+g}m"
         depth = scene.caster.view(camera).depth
+        if split == "test":
+            camera = moved(camera, np.array([config.turned, -config.turned, 0, 0, 0, 0]))
+        path = "drive" if split != "shift" else f"shift_{shift:+g}m"
         yield FrameRecord(item.id, camera, encoded(picture), split, path, shift, mask=mask, depth=depth).to_record()
 
     def finish(self, config, inputs, draft):
@@ -98,7 +102,7 @@ SYSTEM = System(
         "capture": "tests.neuras.line:Capture",
         "atlas": "tests.neuras.line:Atlas",
         "fit": "tests.neuras.line:Fit",
-        "bake": "stages.neuras.s04_bake:Bake",
-        "evaluate": "stages.neuras.s05_evaluate:Evaluate",
+        "bake": "stages.neuras.s05_bake:Bake",
+        "evaluate": "stages.neuras.s06_evaluate:Evaluate",
     },
 )

@@ -75,7 +75,7 @@ def noisy(seed: int = 0, sigma: float = 8) -> tuple[np.ndarray, np.ndarray]:
 
 def test_without_a_mask_the_scores_are_those_of_the_whole_picture():
     photo, other = noisy()
-    found = scores.score(photo, other, np.ones((40, 60), bool), scores.scorers("none", None))
+    found = scores.score(photo, other, np.ones((40, 60), bool), scores.scorers((), None))
     assert found["mse"] == pytest.approx(np.mean((photo / 255 - other / 255) ** 2), abs=1e-6)
     assert found["psnr"] == pytest.approx(-10 * np.log10(np.mean((photo / 255 - other / 255) ** 2)), abs=1e-4)
     assert found["ssim"] == pytest.approx(metrics.ssim(photo / 255, other / 255), abs=1e-6)
@@ -87,7 +87,7 @@ def test_what_a_mask_leaves_out_changes_no_score():
     counts[:, 20:] = False
     black = other.copy()
     black[~counts] = 0
-    known = scores.scorers("none", None)
+    known = scores.scorers((), None)
     assert scores.score(photo, other, counts, known) == scores.score(photo, black, counts, known)
     assert scores.score(photo, other, counts, known) != scores.score(photo, other, np.ones_like(counts), known)
     wrong = other.copy()
@@ -233,6 +233,18 @@ def test_exposure_is_found_on_the_left_half_and_scored_on_the_right(run):
         assert row["counted"] == 0.5 and row["scores"]["ours"]["psnr"] > 45 > 25 > before[id]["scores"]["ours"]["psnr"]
     assert "found on its left half" in (artifacts["evaluate"].path / "files/report.html").read_text()
     assert "found on its left half" not in (plain["evaluate"].path / "files/report.html").read_text()
+
+
+def test_a_view_is_aligned_on_the_left_half_and_scored_on_the_right(run):
+    turned = {"capture": {"turned": 0.02}, "fit": {"error": 0.0}}
+    plain, _ = run(**turned)
+    artifacts, _ = run(**turned, evaluate=QUICK | {"poses": "half"})
+    before = views_of(plain["evaluate"])
+    for id, row in views_of(artifacts["evaluate"]).items():
+        if row["split"] == "test":
+            assert row["counted"] == 0.5 and row["scores"]["ours"]["psnr"] > before[id]["scores"]["ours"]["psnr"] + 3
+    assert "turned and shifted" in (artifacts["evaluate"].path / "files/report.html").read_text()
+    assert "turned and shifted" not in (plain["evaluate"].path / "files/report.html").read_text()
 
 
 def test_without_opengl_and_browser_the_report_says_what_is_missing(run, no_opengl, monkeypatch):

@@ -17,6 +17,7 @@ from model.neuras.losses import vgg_file
 from model.neuras.sampling import Pyramid
 from pipeline.errors import UserError
 from pipeline.plan import plan_stage
+from pipeline.stage import Record
 from pipeline.store.draft import Draft
 from pipeline.store.files import hash_file
 from stages.graphics.arrays import pack_json
@@ -25,7 +26,7 @@ from stages.graphics.casting import Caster
 from stages.graphics.page import png
 from stages.neuras.evaluation.renderers import Reference
 from stages.neuras.records import FRAME, CaptureInfo, FrameRecord, save
-from stages.neuras.s03_fit import Fit, FitStageConfig
+from stages.neuras.s04_fit import Fit, FitStageConfig
 from tests.model.lpips import write_weights
 from tests.neuras import scenes
 
@@ -78,7 +79,7 @@ def inputs(tmp_path_factory):
     info = CaptureInfo("metre", 1.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 8.0, "none", "by hand")
     capture.file("capture.json").write_bytes(pack_json(info.to_json()))
     save(atlas.file("atlas.npz"), flat)
-    return {"capture": capture, "atlas": atlas}
+    return {"capture": capture, "scaffold": Folder(root / "scaffold", [Record("mesh", {})]), "atlas": atlas}
 
 
 def draft(path) -> Draft:
@@ -93,7 +94,8 @@ def run(path, inputs, config=CONFIG):
 
 def test_files_of_a_fit(tmp_path, inputs):
     made, products = run(tmp_path, inputs)
-    assert sorted(products) == ["model.json", "model.safetensors"]
+    assert sorted(products) == ["model.json", "model.safetensors", "poses.json"]
+    assert json.loads(products["poses.json"]) == {}
     baked = Baked.load(made.files)
     flat = scenes.atlas()
     assert baked.mesh_size == Pyramid(flat.width, flat.height, 3).sheet and baked.sky_size == (3, 16)
@@ -105,6 +107,31 @@ def test_files_of_a_fit(tmp_path, inputs):
     assert picture.size == (40, 64)
     assert (made.files / "curve.png").exists() and any((made.files / "tensorboard").iterdir())
     assert "seconds" not in json.dumps(json.loads(products["model.json"]))
+
+
+def test_cameras_are_those_that_were_refined(tmp_path, inputs):
+    """A capture whose poses are off, refined to the true ones, gives the same scene."""
+    whole = run(tmp_path / "true", inputs)[1]
+    poses, wrong = {}, []
+    for record in inputs["capture"].records.values():
+        photo = FrameRecord.from_record(record)
+        if photo.split == "train":
+            poses[photo.id] = photo.camera.camera_to_world.tolist()
+            photo = dataclasses.replace(photo, camera=photo.camera.moved(np.array([0.3, 0.0, 0.0])))
+        wrong.append(photo.to_record())
+    capture = Folder(tmp_path / "capture", wrong)
+    capture.file("capture.json").write_bytes(inputs["capture"].file("capture.json").read_bytes())
+    scaffold = Folder(tmp_path / "scaffold", [Record("mesh", {"poses.json": pack_json(poses)})])
+    refined = run(tmp_path / "refined", {**inputs, "capture": capture, "scaffold": scaffold})[1]
+    assert refined["model.safetensors"] == whole["model.safetensors"]
+    assert json.loads(refined["poses.json"]) == poses
+    assert run(tmp_path / "wrong", {**inputs, "capture": capture})[1]["model.safetensors"] != whole["model.safetensors"]
+
+
+@pytest.mark.parametrize("focal, side", [(274.0, 256), (657.0, 512), (10.0, 64), (400.0, 384)])
+def test_texels_of_the_sky_follow_the_photos(focal, side):
+    assert FitStageConfig().fit(1.0, focal).sky_side == side
+    assert FitStageConfig(sky_side=100).fit(1.0, focal).sky_side == 100
 
 
 def test_the_unseen_frame_is_rendered_well(tmp_path, inputs):
@@ -242,4 +269,4 @@ def test_every_setting_reaches_the_loop():
 
     names = {field.name for kind in (FitConfig, ShaderConfig) for field in dataclasses.fields(kind)}
     assert names - set(FitStageConfig.model_fields) == {"shader", "voxel"}
-    assert FitStageConfig(voxel_m=0.5).fit(metre=2.0).voxel == 1.0
+    assert FitStageConfig(voxel_m=0.5).fit(metre=2.0, focal=300).voxel == 1.0

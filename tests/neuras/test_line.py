@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from pipeline.store import Store
-from stages.neuras.records import CaptureInfo, frames, load_atlas, scaffold_mesh
+from stages.neuras.records import CaptureInfo, frames, load_atlas, refined_poses, scaffold_mesh
 from tests.neuras.processes import artifact, run_pipeline
 
 SMALL = [
@@ -42,6 +42,9 @@ def test_from_nothing_to_a_page(line):
     assert {view.split for view in views} == {"train", "validation", "test", "shift"} or len(views) >= 5
     assert CaptureInfo.of(capture).units == "metre"
     mesh, atlas = scaffold_mesh(artifact(store, "scaffold")), load_atlas(artifact(store, "atlas").file("atlas.npz"))
+    refined = scaffold_mesh(artifact(store, "refine"))
+    assert np.array_equal(mesh.vertices, refined.vertices) and np.array_equal(mesh.faces, refined.faces)
+    assert set(refined_poses(artifact(store, "refine"))) == {view.id for view in views if view.split == "train"}
     assert 500 < len(mesh.faces) <= 4100 and len(atlas.faces) == len(mesh.faces)
     site = artifact(store, "bake").path / "files" / "site"
     assert {"index.html", "viewer.js", "scene.json", "geometry.glb", "mesh_codes.png"} <= {path.name for path in site.iterdir()}
@@ -49,7 +52,7 @@ def test_from_nothing_to_a_page(line):
 
 def test_a_second_run_computes_nothing(line):
     store, _ = line
-    assert run(store, "stage=bake").count("up to date") == 5
+    assert run(store, "stage=bake").count("up to date") == 6
 
 
 def test_the_line_ends_with_a_report_that_says_where_the_page_is(line):
@@ -61,7 +64,7 @@ def test_the_line_ends_with_a_report_that_says_where_the_page_is(line):
     assert any("site/index.html" in text for text in output)
     made = artifact(store, "evaluate")
     assert {row.group for row in made.rows()} == {"test", "shift"}
-    assert run(store, "stage=evaluate", *QUICK).count("up to date") == 6
+    assert run(store, "stage=evaluate", *QUICK).count("up to date") == 7
     assert "equal to before" in run(store, "stage=evaluate", *QUICK, "force=evaluate", "workers=0")
 
 
@@ -85,7 +88,7 @@ def test_rows_of_a_table_are_made_where_they_are_missing_and_end_on_its_page(lin
 def test_other_steps_fit_anew_and_render_no_street(line):
     store, _ = line
     output = run(store, "stage=bake", "fit.steps=31")
-    assert output.count("up to date") == 3
+    assert output.count("up to date") == 4
     fits = Store(store).artifacts("neuras/fit")
     assert len({fit.digest for fit in fits}) == 2
 
@@ -93,7 +96,7 @@ def test_other_steps_fit_anew_and_render_no_street(line):
 def test_the_same_line_elsewhere_has_the_same_bytes_with_other_workers(line, tmp_path):
     store, _ = line
     run(tmp_path, "stage=bake", "workers=0")
-    for stage in ("capture", "scaffold", "atlas", "fit", "bake"):
+    for stage in ("capture", "scaffold", "refine", "atlas", "fit", "bake"):
         others = {other.key: other.digest for other in Store(store).artifacts(f"neuras/{stage}")}
         again = artifact(tmp_path, stage)
         assert again.digest == others[again.key], stage

@@ -131,14 +131,18 @@ def neuras(root: Path) -> dict[str, Artifact]:
     arrays = pack_arrays({"vertices": flat.vertices, "faces": flat.faces})
     surface = [Record("mesh", {"mesh.npz": arrays, "mesh.json": pack_json({"faces": len(flat.faces)})})]
     made["scaffold"] = commit(root, "neuras/scaffold", surface, {"capture": made["capture"]})
+    refined = [Record("mesh", {**surface[0].members, "poses.json": pack_json({})})]
+    made["refine"] = commit(root, "neuras/refine", refined, {"capture": made["capture"], "scaffold": made["scaffold"]})
     work = root.parent / "neuras"
     work.mkdir()
     save(work / "atlas.npz", flat)
     tile = [Record("tile_0000", {"tile.npz": pack_arrays({name: np.asarray(value) for name, value in vars(flat).items()})})]
     unfolded = {"atlas.npz": (work / "atlas.npz").read_bytes()}
-    made["atlas"] = commit(root, "neuras/atlas", tile, {"scaffold": made["scaffold"]}, unfolded)
+    made["atlas"] = commit(root, "neuras/atlas", tile, {"scaffold": made["refine"]}, unfolded)
     curve = {"curve.csv": b"step,loss,validation_psnr\n1,0.5,\n2,0.25,20\n", "validation/step-0000002.png": png(5)}
-    made["fit"] = commit(root, "neuras/fit", [], {"atlas": made["atlas"], "capture": made["capture"]}, curve)
+    made["fit"] = commit(
+        root, "neuras/fit", [], {"atlas": made["atlas"], "capture": made["capture"], "scaffold": made["refine"]}, curve
+    )
     write_site(work / "site", scenes.baked(flat, networks=False), flat, INFO, frames, (0.1, 100.0), "fp16")
     site = {str(path.relative_to(work)): path.read_bytes() for path in sorted((work / "site").rglob("*")) if path.is_file()}
     made["bake"] = commit(root, "neuras/bake", [], {"fit": made["fit"], "capture": made["capture"]}, site)

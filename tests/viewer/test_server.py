@@ -82,7 +82,7 @@ def test_every_artifact_and_record_of_both_systems_has_panels(server, store):
                 status, _, data = ask(server, f"/api/lazy?artifact={artifact.name}&record={record}&path={quote(path)}")
                 assert status == 200, data
     assert all("space" in kinds[stage] for stage in ("collect", "remesh", "decimate", "scene", "render", "shard"))
-    assert all("space" in kinds[f"neuras/{stage}"] for stage in ("capture", "scaffold", "atlas", "evaluate"))
+    assert all("space" in kinds[f"neuras/{stage}"] for stage in ("capture", "scaffold", "refine", "atlas", "evaluate"))
     assert {"curves", "pictures"} <= kinds["train"] and {"curves", "pictures"} <= kinds["neuras/fit"]
     assert {"images", "page"} <= kinds["evaluate"] and "page" in kinds["neuras/bake"] and "images" in kinds["probe"]
 

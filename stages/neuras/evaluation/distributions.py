@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pipeline.store import Artifact
+from pipeline.stage import Inputs
 from stages.graphics.metrics import Metric
 from stages.neuras.evaluation import paths
 from stages.neuras.evaluation.renderers import Scene, as_bytes
-from stages.neuras.evaluation.views import warping
+from stages.neuras.evaluation.views import Training, warping
 from stages.neuras.records import frames
 
 LEAST = 2  # images of a set: a covariance needs two
@@ -128,17 +128,18 @@ def photographed(
 
 
 def imagined(
-    scene: Scene, capture: Artifact, splits: Sequence[str], shifts: Sequence[float], nearest: int
+    scene: Scene, inputs: Inputs, splits: Sequence[str], shifts: Sequence[float], nearest: int
 ) -> tuple[dict[str, list[str]], Pictures]:
     """The same where nobody has photographed: the frames of ``splits``, moved by ``shifts`` (metres) to both sides."""
     reference = scene.reference()
-    warped = warping(capture, reference, scene.info.radius, nearest)
+    training = Training.of(inputs["capture"], inputs["fit"])
+    warped = warping(training, reference, scene.info.radius, nearest)
     cameras, sets = {}, {}
     for metres in shifts:
         sides: dict[str, list[str]] = {}
         for shift, side in ((-metres, "left"), (metres, "right")):
             sides[side] = []
-            for frame in frames(capture, *splits):
+            for frame in frames(inputs["capture"], *splits):
                 (cameras[key := f"{frame.id} {shift:+g}"],) = paths.beside([frame.camera], shift * scene.info.metre)
                 sides[side].append(key)
         sets |= {f"{metres:g} m to the {side}": keys for side, keys in sides.items()}

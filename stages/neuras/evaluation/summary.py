@@ -17,7 +17,7 @@ METHODS = {
     "shader": "ours, baked shader",
     "warping": "multi-view warping",
 }
-View = Mapping[str, Any]  # a record's metrics.json, see stages.neuras.s05_evaluate
+View = Mapping[str, Any]  # a record's metrics.json, see stages.neuras.s06_evaluate
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,22 +12,55 @@ import numpy as np
 from model.neuras.exposure import halves, matched
 from pipeline.errors import Reject
 from pipeline.store import Artifact
+from stages.graphics.cameras import Camera
 from stages.graphics.metrics import SSIM_MIN_SIZE
 from stages.neuras.baking.drawing import Drawing
 from stages.neuras.evaluation import scores
 from stages.neuras.evaluation.renderers import Reference, as_bytes
 from stages.neuras.evaluation.warping import Source, Warping
-from stages.neuras.records import FrameRecord
+from stages.neuras.records import AtlasMesh, FrameRecord, Mesh, Poses, fitted_poses, posed
+from stages.neuras.surfaces import photometric
 
 GAIN = 4  # of a difference
 LEAST = 0.01  # share of a view's pixels that its mask must leave
 CACHED = 8  # photos that a worker keeps for warping
 
 
+class Training:
+    """The training photos, each read when it is needed. Their cameras are those that the scene was fitted with."""
+
+    def __init__(self, capture: Artifact, poses: Poses):
+        self._capture, self._poses = capture, poses
+        self._ids = capture.ids("train")
+        self.cameras = [self.frame(index).camera for index in range(len(self._ids))]
+
+    @classmethod
+    def of(cls, capture: Artifact, fit: Artifact) -> Training:
+        return cls(capture, fitted_poses(fit))
+
+    def frame(self, index: int) -> FrameRecord:
+        return next(posed([FrameRecord.from_record(self._capture.read(self._ids[index]))], self._poses))
+
+
+class Aligner:
+    """Finds where a held-out photo was taken from, by the nearest training photos and the mesh."""
+
+    def __init__(self, training: Training, mesh: AtlasMesh):
+        self._training, self._mesh = training, Mesh(mesh.vertices, mesh.faces)
+        self._settings = photometric.Settings()
+
+    def align(self, camera: Camera, image: np.ndarray, counts: np.ndarray) -> Camera:
+        """``counts``: (H, W) bool, the pixels that may be looked at."""
+        near = photometric.nearest(self._training.cameras, camera.position, self._settings.neighbours)
+        photos = [photometric.Photo(f.camera, f.image(), f.counts()) for f in map(self._training.frame, near)]
+        return photometric.align(photometric.Photo(camera, image, counts), self._mesh, photos, self._settings)
+
+
 @dataclass(frozen=True, eq=False)
 class Examiner:
     """Draws and measures views. drawings: the baked shader by texture format; empty without OpenGL. exposure: whether every
-    picture takes the photo's exposure, found on the left half, and is scored on the right half alone.
+    picture takes the photo's exposure, found on the left half. aligner: turns and shifts the view's camera until its left half
+    agrees with the training photos; without it the camera is the capture's. With either, the right half alone is scored.
     """
 
     reference: Reference
@@ -36,10 +69,14 @@ class Examiner:
     scorers: Mapping[str, scores.Scorer]
     depth_tolerance: float
     exposure: bool = False
+    aligner: Aligner | None = None
 
     def examine(self, frame: FrameRecord) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """What is measured of the view, as plain JSON, and its pictures by name, (H, W, 3) uint8."""
         photo, counts = frame.image(), _counts(frame)
+        known, unknown = (counts & half for half in halves(counts.shape))
+        if self.aligner is not None:
+            frame = replace(frame, camera=self.aligner.align(frame.camera, photo, known))
         seen = self.reference.caster.view(frame.camera)
         exact = self.reference.shade(frame.camera, seen)
         warped, covered = self.warping.render(frame.camera)
@@ -48,8 +85,9 @@ class Examiner:
         if drawn:
             pictures["shader"] = as_bytes(drawn["fp16"])
         if self.exposure:
-            known, counts = (counts & half for half in halves(counts.shape))
             pictures = {name: matched(picture, photo, known) for name, picture in pictures.items()}
+        if self.exposure or self.aligner is not None:
+            counts = unknown
         errors = None
         if frame.depth is not None:
             depths = (seen.depth, frame.depth)
@@ -69,18 +107,16 @@ class Examiner:
         return facts, {**pictures, "photo": photo, "difference": difference(photo, pictures["ours"], counts)}
 
 
-def warping(capture: Artifact, reference: Reference, radius: float, nearest: int) -> Warping:
-    """Warping from a capture's training photos, each read when it is needed."""
-    ids = capture.ids("train")
-    cameras = [FrameRecord.from_record(capture.read(id)).camera for id in ids]
+def warping(training: Training, reference: Reference, radius: float, nearest: int) -> Warping:
+    """Warping from the training photos."""
 
     @functools.lru_cache(CACHED)
     def source(index: int) -> Source:
-        frame = FrameRecord.from_record(capture.read(ids[index]))
+        frame = training.frame(index)
         image = frame.image().astype(np.float32) / 255
         return Source(frame.camera, image, frame.counts(), reference.caster.view(frame.camera))
 
-    return Warping(reference.caster, cameras, source, radius, nearest)
+    return Warping(reference.caster, training.cameras, source, radius, nearest)
 
 
 def difference(photo: np.ndarray, picture: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -39,7 +39,7 @@ class Bake(RunStage):
         from model.neuras.baked import Baked
         from stages.neuras.baking import site
         from stages.neuras.baking.drawing import depth_range
-        from stages.neuras.records import CaptureInfo, frames, load_atlas
+        from stages.neuras.records import CaptureInfo, fitted_poses, frames, load_atlas, posed
 
         capture = inputs["capture"]
         baked = Baked.load(inputs["fit"].path / "files")
@@ -51,7 +51,7 @@ class Bake(RunStage):
                 "atlas.max_megatexels, or raise bake.largest for devices that take more"
             )
         info = CaptureInfo.of(capture)
-        views = list(frames(capture))
+        views = list(posed(frames(capture), fitted_poses(inputs["fit"])))
         shown = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, config.frames).round().astype(int))]
         sizes = site.write_site(
             draft.files / "site", baked, atlas, info, shown, depth_range(atlas.vertices, info.metre), config.textures

@@ -40,8 +40,8 @@ class AtlasConfig(StageConfig):
 
 class Atlas(MapStage):
     name: ClassVar[str] = "atlas"
-    version: ClassVar[int] = 2
-    inputs: ClassVar[tuple[str, ...]] = ("capture", "scaffold")
+    version: ClassVar[int] = 3
+    inputs: ClassVar[dict[str, str]] = {"capture": "capture", "scaffold": "refine"}
     Config: ClassVar[Any] = AtlasConfig
     reasons: ClassVar[dict[str, str]] = {"not_unfolded": "xatlas left faces of the tile without a chart"}
     limits: ClassVar[dict[str, float]] = {"cpu_s": 1800.0, "wall_s": 5400.0, "memory_gb": 8.0}

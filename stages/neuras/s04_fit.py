@@ -1,13 +1,15 @@
 """Stage fit: textures, skyboxes, codebooks and both networks, learned once per scene (sections 3.1 to 3.3).
 
 Reads capture's training and validation frames and the atlas; writes ``model.safetensors`` and ``model.json`` (``Baked``),
-``curve.csv`` and ``curve.png``, ``validation/`` (truth above, ours below) and ``tensorboard/``. What each pixel
-sees of the mesh is cast anew in a run that goes on: 0.05 CPU-s a frame. The loop is ``model.neuras.fitting.fit``.
+``poses.json`` (of the training cameras that *refine* moved), ``curve.csv`` and ``curve.png``, ``validation/`` (truth above,
+ours below) and ``tensorboard/``. What each pixel sees of the mesh is cast anew in a run that goes on: 0.05 CPU-s a frame.
+The loop is ``model.neuras.fitting.fit``.
 """
 
 from __future__ import annotations
 
 import json
+import statistics
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from stages.neuras.records import AtlasMesh, CaptureInfo, FrameRecord
 
 VGG_LEAST = 16  # pixels along a patch: VGG16 halves it four times
+SKY_STEP, SKY_MOST = 64, 512  # texels: a face spans two focal lengths, and a device keeps 36 faces
 REACH = 3.0  # texels of a level around a chart that a sample may read
 
 
@@ -44,7 +47,7 @@ class FitStageConfig(StageConfig):
     codes: int = Field(1024, ge=0, le=65536)  # K of each codebook; 0: no quantization
     skyboxes: int = Field(6, ge=1, le=16)  # L
     texture_levels: int = Field(3, ge=1, le=5)  # of the mesh's texture, each half as wide and high; 1: the paper's
-    sky_side: int = Field(256, ge=8, le=8192)  # texels along a face of a skybox
+    sky_side: int | None = Field(None, ge=8, le=8192)  # texels along a face of a skybox; null: one per two pixels, at most 512
     sky_near_m: float = Field(150.0, gt=0)  # half size of the nearest skybox
     sky_far_m: float = Field(2400.0, gt=0)
     # Optimization
@@ -94,8 +97,8 @@ class FitStageConfig(StageConfig):
                 )
         return self
 
-    def fit(self, metre: float) -> FitConfig:
-        """The loop's part: the fields of the same names, lengths in world units."""
+    def fit(self, metre: float, focal: float) -> FitConfig:
+        """The loop's part: the fields of the same names, lengths in world units. focal: of the photos, in pixels."""
         import dataclasses
 
         from model.neuras.scene import FitConfig, ShaderConfig
@@ -103,13 +106,15 @@ class FitStageConfig(StageConfig):
         def those_of(kind: Any) -> dict[str, Any]:
             return {f.name: getattr(self, f.name) for f in dataclasses.fields(kind) if f.name in type(self).model_fields}
 
-        return FitConfig(shader=ShaderConfig(**those_of(ShaderConfig)), voxel=self.voxel_m * metre, **those_of(FitConfig))
+        side = min(max(round(focal / SKY_STEP), 1) * SKY_STEP, SKY_MOST) if self.sky_side is None else self.sky_side
+        fields = those_of(FitConfig) | {"sky_side": side, "voxel": self.voxel_m * metre}
+        return FitConfig(shader=ShaderConfig(**those_of(ShaderConfig)), **fields)
 
 
 class Fit(RunStage):
     name: ClassVar[str] = "fit"
-    version: ClassVar[int] = 3
-    inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas")
+    version: ClassVar[int] = 4
+    inputs: ClassVar[dict[str, str]] = {"capture": "capture", "scaffold": "refine", "atlas": "atlas"}
     Config: ClassVar[Any] = FitStageConfig
 
     def slug(self, config: FitStageConfig) -> str:
@@ -127,7 +132,7 @@ class Fit(RunStage):
 
         from model.neuras.fitting import Outputs, fit
         from stages.graphics.casting import Caster
-        from stages.neuras.records import CaptureInfo, frames, load_atlas
+        from stages.neuras.records import POSES, CaptureInfo, frames, load_atlas, posed, refined_poses, save_poses
 
         if config.threads is not None:
             torch.set_num_threads(config.threads)
@@ -135,7 +140,9 @@ class Fit(RunStage):
         info = CaptureInfo.of(inputs["capture"])
         atlas = load_atlas(inputs["atlas"].file("atlas.npz"))
         caster = Caster(atlas.vertices, atlas.faces)
-        training = [_view(frame, atlas, caster) for frame in frames(inputs["capture"], "train")]
+        poses = refined_poses(inputs["scaffold"])
+        photos = list(posed(frames(inputs["capture"], "train"), poses))
+        training = [_view(frame, atlas, caster) for frame in photos]
         validation = [_view(frame, atlas, caster) for frame in frames(inputs["capture"], "validation")]
         if not training:
             raise UserError("the capture has no training frame: look at its split")
@@ -147,12 +154,19 @@ class Fit(RunStage):
         )
         surroundings = _surroundings(config, info, atlas, [view.origin for view in training + validation])
         device = choose_device(config.device, "fit.device")
-        baked, summary = fit(config.fit(info.metre), surroundings, training, validation, outputs, device)
+        fitting = config.fit(info.metre, focal_length(photos))
+        baked, summary = fit(fitting, surroundings, training, validation, outputs, device)
         baked.save(draft.files)
+        save_poses(draft.files, poses)
         rows = [json.loads(line) for line in (draft.state / "log.jsonl").read_text().splitlines()]
         _write_curve(rows, draft.files)
         draft.note("fitting", summary)
-        return ["model.json", "model.safetensors"]
+        return ["model.json", "model.safetensors", POSES]
+
+
+def focal_length(photos: Iterable[FrameRecord]) -> float:
+    """The median, in pixels."""
+    return statistics.median(photo.camera.fx for photo in photos)
 
 
 def _view(frame: FrameRecord, atlas: AtlasMesh, caster: Any) -> View:

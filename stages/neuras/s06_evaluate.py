@@ -32,6 +32,7 @@ class EvaluateConfig(StageConfig):
     warping_views: int = Field(4, ge=1)  # nearest photos that warping takes for a view
     depth_tolerance: float = Field(0.05, gt=0)  # of the mesh, relative to the true depth
     exposure: Literal["none", "half"] = added("none", legacy="none")  # half: found on the left half, scored on the right
+    poses: Literal["none", "half"] = added("none", legacy="none")  # half: camera aligned on the left half, scored on the right
     lpips: LpipsSetting = NONE
     lpips_folder: str | None = runtime(None)  # where its weights lie; None: see model.weights
     inception: bool = report(False)  # FID and KID beside the drive
@@ -95,18 +96,20 @@ class Evaluate(MapStage):
 
         from stages.neuras.evaluation.renderers import Scene
         from stages.neuras.evaluation.scores import scorers
-        from stages.neuras.evaluation.views import Examiner, warping
+        from stages.neuras.evaluation.views import Aligner, Examiner, Training, warping
 
         torch.set_num_threads(1)  # sums in another order round differently
         scene, capture = Scene.of(inputs), inputs["capture"]
         reference = scene.reference()
+        training = Training.of(capture, inputs["fit"])
         examiner = Examiner(
             reference,
             {} if environment["opengl"] is None else {kind: scene.drawing(kind) for kind in ("fp16", "rgba8")},
-            warping(capture, reference, scene.info.radius, config.warping_views),
+            warping(training, reference, scene.info.radius, config.warping_views),
             scorers(lpips_networks(config.lpips), config.lpips_folder),
             config.depth_tolerance,
             config.exposure == "half",
+            Aligner(training, scene.atlas) if config.poses == "half" else None,
         )
         return examiner, capture
 
@@ -150,7 +153,7 @@ class Evaluate(MapStage):
             return draft.read(frame, (f"{name}.png",)).members[f"{name}.png"]
 
         if config.inception:
-            summary["distributions"] = _distributions(config, scene, inputs["capture"], summary, picture)
+            summary["distributions"] = _distributions(config, scene, inputs, summary, picture)
         write_json(draft.files / "metrics.json", summary)
         write_json(draft.files / "timing.json", timing)
         html = report.page(about, summary, timing, missing, clips, picture)
@@ -168,7 +171,7 @@ class Evaluate(MapStage):
 def _distributions(
     config: EvaluateConfig,
     scene: Scene,
-    capture: Artifact,
+    inputs: Inputs,
     summary: dict[str, Any],
     picture: Callable[[str, str], bytes],
 ) -> list[dict[str, Any]]:
@@ -179,8 +182,8 @@ def _distributions(
     sets, pictures = distributions.photographed(summary["groups"], picture)
     if not sets:
         along = [split for split in config.splits if split != "shift"]
-        sets, pictures = distributions.imagined(scene, capture, along, config.shifts_m, config.warping_views)
-    photos = (frame.image() for frame in frames(capture, "train", "validation", "test"))
+        sets, pictures = distributions.imagined(scene, inputs, along, config.shifts_m, config.warping_views)
+    photos = (frame.image() for frame in frames(inputs["capture"], "train", "validation", "test"))
     return distributions.judge(sets, pictures, photos, config.inception_folder)
 
 

@@ -1,0 +1,88 @@
+"""Stage refine: the scaffold's vertices and the training cameras, moved until the photos agree.
+
+Reads a capture's training frames and the scaffold; writes one record "mesh" of the scaffold's shape, and beside it the poses
+of the frames whose cameras moved. Real cameras' poses are off by a pixel and more, and one texture shows the mean of what
+disagrees. ``stages.neuras.surfaces.photometric`` does it. Held-out frames keep their poses: they are not looked at.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import Field
+
+from pipeline.config import StageConfig
+from pipeline.stage import Inputs, Item, MapStage, Record
+from stages.graphics.arrays import pack_arrays, pack_json, unpack_json
+
+if TYPE_CHECKING:
+    from pipeline.store import Draft
+    from stages.neuras.surfaces.photometric import Settings
+
+
+class RefineConfig(StageConfig):
+    """Offsets and motions are measured in pixels of the nearest camera."""
+
+    vertices: bool = False  # they move along their normals
+    cameras: bool = True  # they turn and shift
+    blurs: tuple[float, ...] = Field((4.0, 2.0, 1.0), min_length=1)  # sigma of each level, coarse to fine
+    rounds: int = Field(3, ge=1)  # steps of each level
+    neighbours: int = Field(4, ge=1)  # nearest photos that a photo is compared with
+    stride: int = Field(2, ge=1)  # pixels from sample to sample
+    smoothness: float = Field(1.0, ge=0)  # weight of what neighbouring vertices' offsets differ by
+    closeness: float = Field(0.02, gt=0)  # weight of offsets
+    camera_closeness: float = Field(0.003, gt=0)  # weight of motions
+    least_gain: float = Field(0.01, ge=0, lt=1)  # share of the difference that must go, or nothing moves
+
+    def settings(self) -> Settings:
+        from stages.neuras.surfaces.photometric import Settings
+
+        return Settings(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Settings)})
+
+
+class Refine(MapStage):
+    """A map stage of one item, so that the limits on time and memory hold for it."""
+
+    name: ClassVar[str] = "refine"
+    version: ClassVar[int] = 1
+    inputs: ClassVar[tuple[str, ...]] = ("capture", "scaffold")
+    Config: ClassVar[Any] = RefineConfig
+    limits: ClassVar[dict[str, float]] = {"cpu_s": 7200.0, "wall_s": 14400.0, "memory_gb": 20.0}
+
+    def slug(self, config: RefineConfig) -> str:
+        return "-".join(name for name in ("vertices", "cameras") if getattr(config, name)) or "none"
+
+    def items(self, config: RefineConfig, inputs: Inputs) -> Iterable[Item]:
+        return [Item("mesh")]
+
+    def max_workers(self, config: RefineConfig, environment: dict[str, Any]) -> int:
+        return 1
+
+    def open(self, config: RefineConfig, inputs: Inputs, environment: dict[str, Any]) -> Any:
+        from stages.graphics.geometry import one_thread
+
+        one_thread()
+        return config, inputs["capture"], inputs["scaffold"]
+
+    def process(self, worker: Any, item: Item) -> Iterator[Record]:
+        from stages.neuras.records import POSES, frames, scaffold_mesh
+        from stages.neuras.surfaces.photometric import Photo, refine
+
+        config, capture, scaffold = worker
+        mesh, views, lines = scaffold_mesh(scaffold), list(frames(capture, "train")), []
+        cameras = [view.camera for view in views]
+        if (config.vertices or config.cameras) and len(views) > 1:
+            photos = [Photo(view.camera, view.image(), view.counts()) for view in views]
+            mesh, cameras = refine(mesh, photos, config.settings(), lines.append)
+        arrays = pack_arrays({"vertices": mesh.vertices, "faces": mesh.faces})
+        members = {"mesh.npz": arrays, "mesh.json": pack_json({"steps": lines})}
+        if config.cameras:
+            poses = {view.id: camera.camera_to_world.tolist() for view, camera in zip(views, cameras, strict=True)}
+            members[POSES] = pack_json(poses)
+        yield Record(item.id, members)
+
+    def finish(self, config: RefineConfig, inputs: Inputs, draft: Draft) -> None:
+        for line in unpack_json(draft.read("mesh").members["mesh.json"])["steps"]:
+            draft.log(line)
