@@ -53,6 +53,7 @@ def test_rows_differ_in_what_they_say_alone(jobs):
     assert differ("figure7", "atlas") == {"charts": ["xatlas", "xatlas", "planar"]}
     assert differ("table6", "capture") == {"true_mesh": [False, False, True]}
     assert differ("table6", "scaffold") == {"source": ["auto", "distance_field", "auto"]}
+    assert differ("table6", "atlas") == {"charts": ["xatlas", "planar", "xatlas"]}
     assert differ("table5", "capture")["object"] == ["car", "house", "tree"]
     assert jobs["table2"]["ours"].plan["capture"].config.preset == "drone"
     # one street, one fit, however many tables show it
