@@ -51,13 +51,14 @@ from stages.neuras import s04_fit
 from stages.neuras.baking import site
 from stages.neuras.baking.browser import pictures
 from stages.neuras.baking.drawing import depth_range
+from stages.neuras.commands import size
 from stages.neuras.evaluation import costs
 from stages.neuras.evaluation.drive import scene_of
 from stages.neuras.evaluation.paths import framed
 from stages.neuras.evaluation.renderers import Scene
 from stages.neuras.records import fitted_poses, frames, posed
 
-SIZES = ((640, 360), (1280, 720), (1920, 1080))
+SIZES = "640x360,1280x720,1920x1080"
 LAYERS = (1, 3, 6)
 CHECKS = 15  # validations on the way, of part reach
 Row = Sequence[Any]
@@ -66,9 +67,9 @@ Row = Sequence[Any]
 class Bench:
     """A fitted scene and what it was fitted to."""
 
-    def __init__(self, store: Store, reference: str, steps: int, three: Path | None):
+    def __init__(self, store: Store, reference: str, steps: int, sizes: Sequence[tuple[int, int]], three: Path | None):
         self.scene, self.capture = scene_of(store, reference)
-        self.steps, self.three = steps, three
+        self.steps, self.sizes, self.three = steps, sizes, three
         inputs = store.resolve(reference).manifest["preimage"]["inputs"]
         fit = store.by_key(inputs["fit"])
         assert isinstance(fit, Artifact)
@@ -238,24 +239,24 @@ class Bench:
         for name, scene in self.variants().items():
             with scene.drawing("fp16") as drawing:
                 times = [
-                    statistics.median(costs.frame_times(drawing, [framed(camera, *size) for camera in cameras]))
-                    for size in SIZES
+                    statistics.median(costs.frame_times(drawing, [framed(camera, *wanted) for camera in cameras]))
+                    for wanted in self.sizes
                 ]
             rows.append((name, times))
-        return _sized("milliseconds a frame, OpenGL", rows)
+        return _sized("milliseconds a frame, OpenGL", self.sizes, rows)
 
     def page(self) -> tuple[Row, list[Row]]:
         view = next(view for view in self.views if view.split == "test")
-        shown = [replace(view, camera=framed(view.camera, *size)) for size in SIZES]
+        shown = [replace(view, camera=framed(view.camera, *wanted)) for wanted in self.sizes]
         rows = []
         for name, scene in self.variants().items():
             with tempfile.TemporaryDirectory() as folder:
                 self.write(Path(folder), scene, shown)
-                times = [pictures(Path(folder), [f"frame={n}"], timing=5)[1] for n in range(len(SIZES))]
+                times = [pictures(Path(folder), [f"frame={n}"], timing=5)[1] for n in range(len(self.sizes))]
                 rows.append((name, [statistics.median(t) for t in times]))
         if self.three is not None:
             rows.insert(1, ("plain textured mesh by three.js", [self.by_three(one.camera) for one in shown]))
-        return _sized("milliseconds a frame, browser", rows)
+        return _sized("milliseconds a frame, browser", self.sizes, rows)
 
     def by_three(self, camera: Any) -> float:
         """Milliseconds of a frame by three.js: the mesh with one texture as large as ours, from this camera."""
@@ -363,10 +364,10 @@ def _median(work: Callable[[], Any], times: int = 7) -> float:
     return statistics.median(spent)
 
 
-def _sized(what: str, rows: Sequence[tuple[str, Sequence[float]]]) -> tuple[Row, list[Row]]:
+def _sized(what: str, sizes: Sequence[tuple[int, int]], rows: Sequence[tuple[str, Sequence[float]]]) -> tuple[Row, list[Row]]:
     """Times by resolution, each also as a multiple of the first row's."""
     first = rows[0][1]
-    heads = [f"{width} x {height}" for width, height in SIZES]
+    heads = [f"{width} x {height}" for width, height in sizes]
     cells = [
         (name, *itertools.chain.from_iterable((f"{t:.1f}", f"{t / base:.1f}") for t, base in zip(times, first, strict=True)))
         for name, times in rows
@@ -383,9 +384,11 @@ def main() -> None:
     parser.add_argument("--store", default="store")
     parser.add_argument("--only", default=",".join(PARTS), help=f"parts, comma-separated (default: {','.join(PARTS)})")
     parser.add_argument("--steps", type=int, default=30, help="timed steps of part step")
+    parser.add_argument("--sizes", default=SIZES, help=f"of drawn pictures (default: {SIZES})")
     parser.add_argument("--three", type=Path, help="folder of the unpacked npm package three")
     arguments = parser.parse_args()
-    bench = Bench(Store(arguments.store), arguments.key, arguments.steps, arguments.three)
+    sizes = [size(text) for text in arguments.sizes.split(",")]
+    bench = Bench(Store(arguments.store), arguments.key, arguments.steps, sizes, arguments.three)
     for part in arguments.only.split(","):
         if part not in PARTS:
             parser.error(f"{part} is unknown: choose from {', '.join(PARTS)}")

@@ -155,7 +155,7 @@ TABLES = (
         (
             Row("our scaffold: Poisson", "poisson"),
             Row("marching cubes of a distance field", "distance_field"),
-            Row("the true mesh: the ceiling", "true_mesh"),
+            Row("the true mesh", "true_mesh"),
             Row("marching cubes of Instant-NGP", figures={"psnr": 20.26, "fps": 455}),
             Row("marching cubes of UniSim", figures={"psnr": 21.19, "fps": 336}),
             Row("Instant-NGP itself", figures={"psnr": 23.55, "fps": 8.2}),
