@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from model.errors import InputError
+from model.renderformer.guided.light import dot
 from model.renderformer.layers import Segments
 
 SUBSAMPLES = 4  # rays of a pixel
@@ -156,7 +157,7 @@ class Surface:
         position = hits.interpolate(scenes.corners)
         to_eye = F.normalize(eye - position, dim=-1)
         normal = F.normalize(hits.interpolate(scenes.vertex_normals), dim=-1)
-        normal = torch.where((normal * to_eye).sum(dim=-1, keepdim=True) < 0, -normal, normal)
+        normal = torch.where(dot(normal, to_eye)[..., None] < 0, -normal, normal)
         diffuse, specular = scenes.diffuse[hits.triangle], scenes.specular[hits.triangle]
         roughness = scenes.roughness[hits.triangle][..., None]
         if scenes.textures is not None:
@@ -172,7 +173,7 @@ class Surface:
     @property
     def mirrored(self) -> Tensor:
         """(B, M, 3), the direction in which a mirror sends the ray."""
-        return 2 * (self.to_eye * self.normal).sum(dim=-1, keepdim=True) * self.normal - self.to_eye
+        return 2 * dot(self.to_eye, self.normal)[..., None] * self.normal - self.to_eye
 
 
 def _textured(hits: Hits, scenes: Scenes, *plain: Tensor) -> list[Tensor]:

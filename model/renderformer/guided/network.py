@@ -30,7 +30,15 @@ from model.renderformer.guided.config import (
 )
 from model.renderformer.guided.flops import forward_flops
 from model.renderformer.guided.inputs import POINTS, SUBSAMPLES, Hits, Scenes, Surface
-from model.renderformer.guided.light import diffuse_light, joint_masking, masking, specular_light, vector_form_factor
+from model.renderformer.guided.light import (
+    diffuse_light,
+    dot,
+    joint_masking,
+    masking,
+    specular_light,
+    sum_over_lights,
+    vector_form_factor,
+)
 from model.renderformer.layers import LAYER_EPS, DecoderLayer, EncoderLayer, FeedForward, RMSNorm, Rotation
 
 FREQUENCIES = 4  # of an encoded position: pi, 2 pi, 4 pi, 8 pi
@@ -294,7 +302,7 @@ class GuidedNetwork(Network):
         scene = scenes.scene_of
         lights, radiance = scenes.light_corners[scene], scenes.radiance[scene]  # (T, L, 3, 3), (T, L, 3)
         factor = vector_form_factor(points[:, :, None], lights[:, None])  # (T, 4, L, 3)
-        cosine = (factor * normal[:, None, None]).sum(dim=-1)
+        cosine = dot(factor, normal[:, None, None])
         sides = torch.stack([cosine, -cosine], dim=1).clamp(min=0)  # (T, 2, 4, L)
         seen = scenes.seen[:, None] if self.config.guide.visibility else 1.0
         light = ((sides * seen)[..., None] * radiance[:, None, None]).sum(dim=-2)
@@ -385,7 +393,7 @@ class GuidedNetwork(Network):
             means.normal,
             surface.to_eye,
             surface.mirrored,
-            (surface.to_eye * surface.normal).sum(dim=-1, keepdim=True),
+            dot(surface.to_eye, surface.normal)[..., None],
             means.diffuse,
             means.specular,
             means.roughness,
@@ -417,10 +425,10 @@ class GuidedNetwork(Network):
         scenes = encoded.scenes
         second = Surface.at(hits, scenes, surface.position)
         ways = second.position - surface.position
-        back = ((ways * face_normals(scenes.corners)[hits.triangle]).sum(dim=-1) > 0).long()
+        back = (dot(ways, face_normals(scenes.corners)[hits.triangle]) > 0).long()
         light = hits.between_points(encoded.lit.light.flatten(0, 1), 2 * hits.triangle + back)
         out = F.normalize(ways, dim=-1)
-        eye, away = ((surface.normal * way).sum(dim=-1) for way in (surface.to_eye, out))
+        eye, away = (dot(surface.normal, way) for way in (surface.to_eye, out))
         returned = joint_masking(surface.alpha, eye, away) / masking(surface.alpha, eye)
         there = hits.there * surface.there * (away > 0)[..., None]
         return Reflected(
@@ -442,7 +450,7 @@ class GuidedNetwork(Network):
         shape = specular_light(factor, surface.normal[:, :, None], surface.to_eye[:, :, None], alpha[:, :, None])
         if self.config.guide.visibility:
             shape = shape * hits.between_points(scenes.seen)
-        return (shape[..., None] * scenes.radiance[:, None]).sum(dim=-2)
+        return sum_over_lights(shape, scenes.radiance)
 
     def _reflections(
         self, encoded: Encoded, pixels: Pixels, rays: Surface, means: Surface, mirror: Reflected, surface: Surface
@@ -459,7 +467,7 @@ class GuidedNetwork(Network):
     def _light_sums(self, scenes: Scenes, direct: Direct, coverage: Tensor) -> list[Tensor]:
         """Of each pixel the closed forms of all lights together, diffuse and specular: open, and as far as lights are seen."""
         parts = (direct.diffuse, direct.specular, direct.diffuse * direct.seen, direct.specular * direct.seen)
-        sums = [_mean((part[..., None] * scenes.radiance[:, None]).sum(dim=-2), 1) for part in parts]
+        sums = [_mean(sum_over_lights(part, scenes.radiance), 1) for part in parts]
         share = coverage.clamp(min=1 / SUBSAMPLES)
         return [torch.log1p(total / share) * float(self.config.guide.light) for total in sums]
 
@@ -480,14 +488,14 @@ class GuidedNetwork(Network):
         direction = vector / size.clamp(min=1e-12)
         radiance = scenes.radiance.mean(dim=-1)[:, None]
         bright = [torch.log1p(part * radiance) for part in (diffuse, specular)]
-        cosines = [(direction * way[:, :, None]).sum(dim=-1) for way in (surface.normal, surface.mirrored)]
+        cosines = [dot(direction, way[:, :, None]) for way in (surface.normal, surface.mirrored)]
         parts = [*bright, seen, seen * (1 - seen), *cosines, surface.roughness.expand_as(seen)]
         offset = scenes.light_corners.mean(dim=2)[:, None] - surface.position[:, :, None]
         return torch.cat([direction, offset, torch.stack(parts, dim=-1)], dim=-1)
 
     def _compose(self, scenes: Scenes, known: Known, outputs: Tensor, corrections: Tensor | None) -> Tensor:
         """The image (B, M, 3) from the head's outputs."""
-        rays, direct, radiance = known.rays, known.direct, scenes.radiance[:, None]
+        rays, direct = known.rays, known.direct
         indirect, reflected, gate = outputs.split([3, 3, 1], dim=-1)
         soft = direct.seen.clamp(SOFT, 1 - SOFT)
 
@@ -496,7 +504,7 @@ class GuidedNetwork(Network):
 
         def light(closed_form: Tensor, change: Tensor) -> Tensor:
             seen = (direct.seen + torch.sigmoid(torch.logit(soft) + spread(change)) - soft).clamp(0, 1)
-            return ((closed_form * seen)[..., None] * radiance).sum(dim=-2)
+            return sum_over_lights(closed_form * seen, scenes.radiance)
 
         diffuse, specular = spread(self.positive(indirect)), spread(self.positive(reflected))
         if corrections is not None:
