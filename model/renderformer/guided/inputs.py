@@ -127,7 +127,7 @@ class Hits:
 
     def interpolate(self, values: Tensor) -> Tensor:
         """(T, 3, C) of corners -> (B, M, C)."""
-        return (values[self.triangle] * self.weights[..., None]).sum(dim=-2)
+        return weighted(values[self.triangle], self.weights)
 
     def between_points(self, values: Tensor, rows: Tensor | None = None) -> Tensor:
         """(T, 4, C), of the triangles' ``POINTS`` -> (B, M, C): linear within each triangle of two corners and the centroid.
@@ -136,7 +136,15 @@ class Hits:
         """
         least = self.weights.min(dim=-1, keepdim=True).values
         shares = torch.cat([self.weights - least, 3 * least], dim=-1)
-        return (values[self.triangle if rows is None else rows] * shares[..., None]).sum(dim=-2)
+        return weighted(values[self.triangle if rows is None else rows], shares)
+
+
+def weighted(values: Tensor, weights: Tensor) -> Tensor:
+    """(..., K, C), (..., K) -> (..., C): the sum over K, of few; faster than a reduction."""
+    total = values[..., 0, :] * weights[..., 0, None]
+    for k in range(1, values.shape[-2]):
+        total = torch.addcmul(total, values[..., k, :], weights[..., k, None])
+    return total
 
 
 @dataclass

@@ -82,5 +82,6 @@ def specular_light(factor: Tensor, normal: Tensor, to_eye: Tensor, alpha: Tensor
 
 
 def sum_over_lights(shares: Tensor, radiance: Tensor) -> Tensor:
-    """(B, M, L) shares, (B, L, 3) radiance -> (B, M, 3); in float32 whatever matrix products are computed in."""
-    return torch.stack([(shares * channel[:, None]).sum(dim=-1) for channel in radiance.unbind(dim=-1)], dim=-1)
+    """(B, M, L) shares, (B, L, 3) radiance -> (B, M, 3); not in bfloat16, whatever the network is computed in."""
+    with torch.autocast(shares.device.type, enabled=False):
+        return shares @ radiance

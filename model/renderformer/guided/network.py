@@ -76,25 +76,21 @@ class Pixels:
         main = torch.from_numpy(np.ascontiguousarray(arrays["main"])).to(device).long().clamp(min=0).flatten(1)
         return cls(eye, **hits, main=main, seen=seen.flatten(1, -2), bundles=arrays["hit"].shape[2], bundle=bundle)
 
-    def split(self, most: int) -> Iterator[Pixels]:
-        """The pixels in portions of at most ``most`` bundles of one view each; for one scene."""
-        views = self.eye.shape[1]
+    def landed(self) -> Tensor:
+        """Of one view of one scene the bundles that hit anything."""
+        return self.hit.there.view(self.bundles, -1).any(dim=1).nonzero()[:, 0]
 
-        def portion(rays: Tensor, view: int, first: int, last: int) -> Tensor:
-            grid = rays.unflatten(1, (views, self.bundles, -1))
-            return grid[:, view, first:last].flatten(1, 2)
+    def take(self, bundles: Tensor) -> Pixels:
+        """Some bundles of one view of one scene."""
 
-        for view in range(views):
-            for first in range(0, self.bundles, most):
-                last = min(first + most, self.bundles)
-                hits = {
-                    name: Hits(**{part: portion(value, view, first, last) for part, value in vars(getattr(self, name)).items()})
-                    for name in ("hit", "mirror", "lobe")
-                }
-                main, seen = (portion(values, view, first, last) for values in (self.main, self.seen))
-                yield Pixels(
-                    self.eye[:, view : view + 1], **hits, main=main, seen=seen, bundles=last - first, bundle=self.bundle
-                )
+        def some(rays: Tensor) -> Tensor:
+            return rays.unflatten(1, (self.bundles, -1))[:, bundles].flatten(1, 2)
+
+        hits = {
+            name: Hits(**{part: some(value) for part, value in vars(getattr(self, name)).items()})
+            for name in ("hit", "mirror", "lobe")
+        }
+        return Pixels(self.eye, **hits, main=some(self.main), seen=some(self.seen), bundles=len(bundles), bundle=self.bundle)
 
 
 GUIDES = ("hit", "hit_weights", "main", "mirror", "mirror_weights", "lobe", "lobe_weights", "light_seen")
@@ -256,9 +252,11 @@ class GuidedNetwork(Network):
         most = max(1, AT_ONCE // (lights * SUBSAMPLES * self.config.bundle**2))
         for view in views:
             pixels = Pixels.read(view, encoded.scenes, self.config.bundle)
-            parts = [self.decode(encoded, part) for part in pixels.split(most)]
-            y = torch.log1p(torch.cat(parts, dim=1)) / math.log(10)
-            yield from_bundles(y.unflatten(1, (1, pixels.bundles, -1)), *size, self.config.bundle)[0, 0]
+            radiance = torch.zeros(1, 1, pixels.bundles, self.config.bundle**2, 3, device=device)
+            for bundles in pixels.landed().split(most):  # the others are black
+                radiance[0, 0, bundles] = self.decode(encoded, pixels.take(bundles)).view(len(bundles), -1, 3)
+            y = torch.log1p(radiance) / math.log(10)
+            yield from_bundles(y, *size, self.config.bundle)[0, 0]
 
     def layers(self) -> list[nn.Module]:
         """The units of compilation, recomputation and sharding."""
