@@ -44,6 +44,10 @@ class Network(nn.Module, ABC):
     def tokens(self, batch: Arrays) -> int:
         """Triangles, registers and ray bundles of the batch."""
 
+    def gathering_layers(self) -> list[nn.Module]:
+        """The layers in which ray bundles attend to triangles' tokens."""
+        return []
+
     def without_learning(self) -> Network | None:
         """This network as it was before training, where its image is more than noise then."""
         return None

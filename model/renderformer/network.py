@@ -386,6 +386,9 @@ class RenderFormer(Network):
                 batch = self.decode(tokens, cameras, fov, resolution, projected)
             yield batch  # outside of autocast, which would otherwise stay on in the caller
 
+    def gathering_layers(self) -> list[nn.Module]:
+        return list(self.view_transformer.transformer.layers)
+
     def layers(self) -> list[nn.Module]:
         """Every transformer layer of both stages: the units of compilation, recomputation and sharding."""
         return [*self.transformer.layers, *self.view_transformer.transformer.layers]

@@ -82,11 +82,8 @@ class RunProbe(MapStage):
 
         torch.set_num_threads(1)  # sums in another order round differently
         worker = Worker(config, inputs, environment["renderer"], environment["device"])
-        if PROBES[config.name].inside and worker.model.reads_guides:
-            raise UserError(
-                f"probe={config.name} looks into RenderFormer's two stages, which a guided model does not have: choose another "
-                "probe, or another model"
-            )
+        if reason := PROBES[config.name].refusal(worker.model):
+            raise UserError(f"probe={config.name}: {reason}; choose another probe, or another model")
         return worker
 
     def process(self, worker: Worker, item: Item) -> Iterator[Record]:

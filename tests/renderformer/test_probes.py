@@ -52,6 +52,23 @@ def inputs(tmp_path_factory):
     return {"decimate": decimated(folder / "decimate"), "shard": shard, "train": train}
 
 
+@pytest.fixture(scope="module")
+def guided(inputs, tmp_path_factory):
+    """The same with a guided network."""
+    import torch
+
+    from model.renderformer import checkpoint
+    from model.renderformer.guided.config import GuidedConfig
+    from model.renderformer.guided.network import GuidedNetwork
+
+    torch.manual_seed(0)
+    model = GuidedNetwork(GuidedConfig(token_dim=24, token_layers=1, token_heads=1, head_dim=16, head_layers=1))
+    train = FakeArtifact(tmp_path_factory.mktemp("guided") / "train", [])
+    train.key = "1" * 64
+    checkpoint.save(model.config, model.state_dict(), train.files / "checkpoint", {"triangles": "768", "resolution": "16"})
+    return {**inputs, "train": train}
+
+
 def scenes_of(inputs, split="test") -> list[SceneRecord]:
     from stages.renderformer.dataset import decode_sample
 
@@ -194,21 +211,25 @@ class TestMethods:
 
 
 class TestBesideTheNetwork:
-    def test_attention_weights_are_those_of_the_layers(self, inputs, scene):
+    @pytest.mark.parametrize(("network", "layers"), [("inputs", 2), ("guided", 1)])
+    def test_attention_weights_are_those_of_the_layers(self, network, layers, scene, request):
         import torch
 
         from model.renderformer import checkpoint
         from model.renderformer.layers import merge_heads
 
-        model = checkpoint.load(inputs["train"].file("checkpoint"))[0]
+        model = checkpoint.load(request.getfixturevalue(network)["train"].file("checkpoint"))[0]
         scene = edits.one_view(scene, 0)
         calls = []
         hooks = [
             layer.multihead_attn.register_forward_hook(lambda cross, given, out: calls.append((cross, given, out)))
-            for layer in model.view_transformer.transformer.layers
+            for layer in model.gathering_layers()
         ]
         weights = attention.cross_attention(model, scene, 16)
-        assert weights.shape == (2, 4, 2 + len(scene.triangles)) and np.allclose(weights.sum(axis=-1), 1, atol=1e-5)
+        assert weights.shape == (layers, 4, model.config.registers + len(scene.triangles))
+        assert np.allclose(weights.sum(axis=-1), 1, atol=1e-5)
+            weights.sum(axis=-1), 1, atol=1e-5
+        )
         for row, (cross, given, out) in zip(weights, calls, strict=True):
             mixed = torch.from_numpy(row) @ given[2][0]  # one head: weights times values
             assert torch.allclose(cross.out_proj(merge_heads(mixed[None])), out, atol=1e-5)
@@ -311,6 +332,22 @@ def test_a_probe_runs_from_config_to_figure(name, inputs, tmp_path):
     assert min(Image.open(draft.files / "figure.png").size) > 200
     table = (draft.files / "table.md").read_text()
     assert all(note in table for note in probe_json["notes"]) and table.count("\n| ") == len(probe_json["rows"]) + 2
+
+
+@pytest.mark.parametrize("name", ["attention", "equal_time", "timing"])
+def test_a_guided_model_is_probed_as_well(name, guided, tmp_path):
+    draft = run(guided, tmp_path / "probe", name=name, **(TINY | CHEAP[name]))
+    probe_json = json.loads((draft.files / "probe.json").read_text())
+    assert probe_json["rows"] and "guided by hits" in probe_json["model"]["network"]
+    if name == "equal_time":
+        assert any("casting hits" in note for note in probe_json["notes"])
+    if name == "timing":
+        assert any("casting hits" in column for column in probe_json["columns"])
+
+
+def test_a_probe_that_says_nothing_of_a_network_is_refused(guided, tmp_path):
+    with pytest.raises(UserError, match="probe=tokens: a guided model is given each triangle's light"):
+        run(guided, tmp_path / "probe", name="tokens", **TINY)
 
 
 def test_the_table_says_what_the_records_say(inputs, tmp_path):

@@ -248,20 +248,17 @@ class GuidedNetwork(Network):
         scene: padded arrays of a batch of one; views: of each view the arrays that a batch has besides them.
         """
         encoded = self.encode(Scenes.read(scene, device))
-        lights = max(1, encoded.scenes.radiance.shape[1])
-        most = max(1, AT_ONCE // (lights * SUBSAMPLES * self.config.bundle**2))
         for view in views:
-            pixels = Pixels.read(view, encoded.scenes, self.config.bundle)
-            radiance = torch.zeros(1, 1, pixels.bundles, self.config.bundle**2, 3, device=device)
-            for bundles in pixels.landed().split(most):  # the others are black
-                radiance[0, 0, bundles] = self.decode(encoded, pixels.take(bundles)).view(len(bundles), -1, 3)
-            y = torch.log1p(radiance) / math.log(10)
-            yield from_bundles(y, *size, self.config.bundle)[0, 0]
+            radiance = self.decode_view(encoded, Pixels.read(view, encoded.scenes, self.config.bundle))
+            yield from_bundles(torch.log1p(radiance) / math.log(10), *size, self.config.bundle)[0, 0]
 
     def layers(self) -> list[nn.Module]:
         """The units of compilation, recomputation and sharding."""
         towers = [getattr(self, name)["layers"] for name in ("encoder", "gather") if hasattr(self, name)]
         return [*(layer for tower in towers for layer in tower), *self.head.layers]
+
+    def gathering_layers(self) -> list[nn.Module]:
+        return list(self.gather["layers"]) if self.config.tokens == "encoder" else []
 
     def without_learning(self) -> GuidedNetwork:
         """The closed form alone."""
@@ -355,6 +352,15 @@ class GuidedNetwork(Network):
             features.append(self._gather(encoded, pixels, known))
         outputs, corrections = self.head(torch.cat(features, dim=-1), known.lights)
         return self._compose(encoded.scenes, known, outputs.float(), corrections)
+
+    def decode_view(self, encoded: Encoded, pixels: Pixels) -> Tensor:
+        """(1, 1, K, P^2, 3) radiance of one view of one scene, in portions; bundles that hit nothing are black."""
+        lights, size = max(1, encoded.scenes.radiance.shape[1]), self.config.bundle**2
+        radiance = torch.zeros(1, 1, pixels.bundles, size, 3, device=pixels.eye.device)
+        landed = pixels.landed()
+        for bundles in landed.split(max(1, AT_ONCE // (lights * SUBSAMPLES * size))) if len(landed) else ():
+            radiance[0, 0, bundles] = self.decode(encoded, pixels.take(bundles)).view(len(bundles), size, 3)
+        return radiance
 
     def _gather(self, encoded: Encoded, pixels: Pixels, known: Known) -> Tensor:
         """(B, M, d): what each pixel's bundle gathers from the tokens, by attention at the mean position that it hits."""

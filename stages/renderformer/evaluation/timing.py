@@ -50,10 +50,9 @@ def time_model(model: Network, samples: Sequence[Sample], device: str) -> dict[s
 
     model = model.to(device).eval()
     resolution = next(iter(samples[0].views.values())).image.shape[0]
-    time_one = guided_seconds if model.reads_guides else renderformer_seconds
     rows = []
     for sample in samples:
-        seconds = time_one(model, sample.scene, next(iter(sample.views)), resolution, device)
+        seconds = step_seconds(model, sample.scene, next(iter(sample.views)), resolution, device, REPEATS)
         row = {"id": sample.scene.id, "triangles": len(sample.scene.triangles)}
         rows.append(row | {step: round(value, 6) for step, value in seconds.items()})
     steps = [step for step in STEPS if step in rows[0]]
@@ -67,15 +66,23 @@ def time_model(model: Network, samples: Sequence[Sample], device: str) -> dict[s
     }
 
 
-def renderformer_seconds(model: Any, scene: SceneRecord, view: int, resolution: int, device: str) -> dict[str, float]:
+def step_seconds(model: Network, scene: SceneRecord, view: int, resolution: int, device: str, repeats: int) -> dict[str, float]:
+    """Seconds of each step that the model has, the least of ``repeats`` runs."""
+    seconds = guided_seconds if model.reads_guides else renderformer_seconds
+    return seconds(model, scene, view, resolution, device, repeats)
+
+
+def renderformer_seconds(
+    model: Any, scene: SceneRecord, view: int, resolution: int, device: str, repeats: int
+) -> dict[str, float]:
     from model.renderformer.timing import time_steps
     from stages.renderformer.inference.predict import camera_arrays, padded_arrays
 
-    seconds = time_steps(model, padded_arrays(scene) | camera_arrays(scene, view), resolution, device, REPEATS)
+    seconds = time_steps(model, padded_arrays(scene) | camera_arrays(scene, view), resolution, device, repeats)
     return {name: value for name, value in seconds.items() if name in STEPS}
 
 
-def guided_seconds(model: Any, scene: SceneRecord, view: int, resolution: int, device: str) -> dict[str, float]:
+def guided_seconds(model: Any, scene: SceneRecord, view: int, resolution: int, device: str, repeats: int) -> dict[str, float]:
     """Rays are cast on one thread of the CPU, whatever the device."""
     import torch
 
@@ -94,10 +101,10 @@ def guided_seconds(model: Any, scene: SceneRecord, view: int, resolution: int, d
         encoded = model.encode(scenes)
         pixels = Pixels.read(camera_arrays(scene, view) | batched(view_arrays([cast])), scenes, model.config.bundle)
         return {
-            "cast_scene": fastest(lambda: GuideCaster(scene).scene_guides(), "cpu", REPEATS),
-            "guided_encode": fastest(lambda: model.encode(scenes), device, REPEATS),
-            "cast_view": fastest(lambda: caster.view_guides(view, resolution, resolution), "cpu", REPEATS),
-            "guided_decode": fastest(lambda: model.decode(encoded, pixels), device, REPEATS),
+            "cast_scene": fastest(lambda: GuideCaster(scene).scene_guides(), "cpu", repeats),
+            "guided_encode": fastest(lambda: model.encode(scenes), device, repeats),
+            "cast_view": fastest(lambda: caster.view_guides(view, resolution, resolution), "cpu", repeats),
+            "guided_decode": fastest(lambda: model.decode_view(encoded, pixels), device, repeats),
         }
 
 

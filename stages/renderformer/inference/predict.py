@@ -6,7 +6,7 @@ once, and its views are decoded from the same tokens a few at a time (section 3.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,18 +35,24 @@ def predict_frames(
     """(H, W, 3) float32 linear radiance, at least 0, of each of the scene's cameras ``views``, in order."""
     from model.renderformer.network import to_radiance
 
-    batch = padded_arrays(scene)
     size = (resolution, resolution) if isinstance(resolution, int) else resolution
+    batch, seen_by = network_arrays(model, scene, size)
+    for y in model.to(device).eval().frames(batch, map(seen_by, views), size, device):
+        yield to_radiance(y).clamp(min=0).cpu().numpy()  # the network may undershoot 0 by a thousandth
+
+
+def network_arrays(
+    model: Network, scene: SceneRecord, size: tuple[int, int]
+) -> tuple[dict[str, np.ndarray], Callable[[int], dict[str, np.ndarray]]]:
+    """What the network reads: the scene as a batch of one; of each camera what that has besides. size: height, width."""
     caster = GuideCaster(scene) if model.reads_guides else None
-    if caster is not None:
-        batch |= batched(scene_arrays(caster.scene_guides()))
+    batch = padded_arrays(scene) | ({} if caster is None else batched(scene_arrays(caster.scene_guides())))
 
     def seen_by(view: int) -> dict[str, np.ndarray]:
         guides = {} if caster is None else batched(view_arrays([caster.view_guides(view, *size)]))
         return camera_arrays(scene, view) | guides
 
-    for y in model.to(device).eval().frames(batch, map(seen_by, views), size, device):
-        yield to_radiance(y).clamp(min=0).cpu().numpy()  # the network may undershoot 0 by a thousandth
+    return batch, seen_by
 
 
 def batched(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

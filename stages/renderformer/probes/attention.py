@@ -1,8 +1,9 @@
 """attention: what a ray bundle looks at, drawn on the triangles (paper, figure 8).
 
 For a few ray bundles of a view, the cross-attention weights over the triangle tokens, layer by layer, averaged over the
-heads. One design choice: the weights are computed beside the network, from what its layers are given (forward hooks), so that
-the fast path knows nothing of them.
+heads: of RenderFormer's view-dependent layers, or of the one in which a guided model's bundles gather. One design choice: the
+weights are computed beside the network, from what its layers are given (forward hooks), so that the fast path knows nothing of
+them.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def cross_attention(model: Any, scene: SceneRecord, resolution: int | tuple[int,
     import torch
 
     from model.renderformer.layers import rotate, split_heads
-    from stages.renderformer.inference.predict import predict_scene
+    from stages.renderformer.inference.predict import network_arrays
 
     layer_weights: list[torch.Tensor] = []
 
@@ -54,9 +55,13 @@ def cross_attention(model: Any, scene: SceneRecord, resolution: int | tuple[int,
         weights = (query @ keys.transpose(-1, -2) / query.shape[-1] ** 0.5).softmax(dim=-1)
         layer_weights.append(weights.mean(dim=1)[0].float().cpu())
 
-    hooks = [layer.register_forward_pre_hook(look) for layer in model.view_transformer.transformer.layers]
+    size = (resolution, resolution) if isinstance(resolution, int) else resolution
+    batch, seen_by = network_arrays(model, scene, size)
+    image = np.broadcast_to(np.float32(0), (1, 1, *size, 3))  # whose size alone is read
+    hooks = [layer.register_forward_pre_hook(look) for layer in model.gathering_layers()]
     try:
-        predict_scene(model, scene, [0], resolution, device)
+        with torch.inference_mode():
+            model.to(device).eval()(*model.arguments({**batch, **seen_by(0), "image": image}, device))
     finally:
         for hook in hooks:
             hook.remove()
@@ -92,7 +97,11 @@ class Attention(Probe):
     question = "Which triangles does a ray bundle look at, layer by layer?"
     setting = "ray bundle and layer"
     Config = AttentionConfig
-    inside = True
+
+    def refusal(self, model: Any) -> str | None:
+        if model.gathering_layers():
+            return None
+        return "ray bundles of this model look at no triangles (model.tokens=encoder gives it the attention)"
 
     def items(self, config: AttentionConfig, inputs: Inputs) -> Iterator[Item]:
         for scene_id in self.scene_ids(config, inputs):
@@ -105,10 +114,10 @@ class Attention(Probe):
         prediction = worker.predict(scene)  # first: it says what is wrong with a resolution
         view = worker.trace(scene)
         drawn = worker.trace(scene, resolution=config.drawn_px, max_spp=1, target_error=0.0, denoise=False).triangle
-        patch = worker.model.config.patch_size
+        patch = worker.model.config.bundle_side
         bundles = choose_bundles(view.triangle, scene.object_index, config.bundles, patch)
         weights = cross_attention(worker.model, scene, config.resolution, worker.device)[:, bundles]
-        registers = worker.model.config.num_register_tokens
+        registers = worker.model.config.registers
         side = config.resolution // patch
         tiles = view.triangle.reshape(side, patch, side, patch).swapaxes(1, 2).reshape(side * side, -1)
         lit = scene.light_index >= 0
@@ -142,20 +151,22 @@ class Attention(Probe):
         ids = [row.id for row in draft.rows()]
         facts = [unpack_json(draft.read(id, ("metrics.json",)).members["metrics.json"]) for id in ids]
         figure = self._figure(worker, [draft.read(id) for id in ids[:SHOWN]], facts)
-        registers = worker.model.config.num_register_tokens
+        registers = worker.model.config.registers
         columns = ["layer", "on registers %", "on the bundle's own triangles %", "on lights %", "effective number of tokens"]
         rows = []
-        for layer in range(worker.model.config.view_transformer_n_layers):
+        for layer in range(len(worker.model.gathering_layers())):
             of_layer = [row for fact in facts for row in fact["weights"] if row["layer"] == layer]
             means = {name: np.mean([row[name] for row in of_layer]) for name in ("registers", "own", "lights", "effective")}
             shares = [f"{100 * means[name]:.1f}" for name in ("registers", "own", "lights")]
             rows.append([str(layer + 1), *shares, f"{means['effective']:.0f}"])
         triangles = np.mean([fact["triangles"] for fact in facts])
+        side = worker.model.config.bundle_side
         notes = [
             f"{len(facts)} scene(s), {sum(len(fact['bundles']) for fact in facts)} ray bundles; weights averaged over heads. "
             f"A scene has {triangles:,.0f} triangles on average and {registers} registers: spread evenly, the registers would "
             f"get {100 * registers / (registers + triangles):.1f} %.",
-            "The bundle's own triangles are those that its 8 x 8 pixels see. Effective number of tokens: exp of the entropy.",
+            f"The bundle's own triangles are those that its {side} x {side} pixels see. Effective number of tokens: exp of the "
+            "entropy.",
             "In the figure the square marks the bundle; a layer's picture shows the square root of the weight over the "
             "largest one in it, which is given above: what is half as bright has a quarter of the weight.",
         ]
@@ -169,8 +180,8 @@ class Attention(Probe):
         from stages.graphics.tonemap import exposure_for, to_picture
         from stages.renderformer.probes.figures import WIDTH, new_figure, show_picture
 
-        config, patch = worker.config, worker.model.config.patch_size
-        depth = worker.model.config.view_transformer_n_layers
+        config, patch = worker.config, worker.model.config.bundle_side
+        depth = len(worker.model.gathering_layers())
         layers = sorted({round(layer) for layer in np.linspace(0, depth - 1, min(depth, MOST_LAYERS))})
         bundles = sum(len(fact["bundles"]) for fact in facts[: len(records)])
         columns = len(layers) + 2

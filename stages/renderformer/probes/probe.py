@@ -130,8 +130,11 @@ class Probe:
     question: ClassVar[str]
     setting: ClassVar[str]  # what is varied, with its unit
     Config: ClassVar[type[ProbeConfig]] = ProbeConfig
-    inside: ClassVar[bool] = False  # whether it looks into the network's stages, and not at its pictures alone
     reads: ClassVar[tuple[str, ...]] = ("shard", "train")  # inputs
+
+    def refusal(self, model: Any) -> str | None:
+        """Why the probe would say nothing of this network, if it would not."""
+        return None
 
     def suits(self, meta: Mapping[str, Any]) -> bool:
         """Whether a scene of the shards can be used, from its meta."""

@@ -3,7 +3,7 @@
 Images, metrics and operation counts are records; times are taken as the figure is made, one after the other in the main
 process, after a run that warms up, the fastest of several. One design choice: both sides are timed from a scene's arrays to one
 picture: the path tracer builds the scene, samples, and denoises the picture once (not every light, as the references are); the
-network reads the arrays, encodes and decodes.
+network reads the arrays, encodes and decodes, and a guided one casts its rays besides.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pydantic import field_validator
 from pipeline.config import count
 from pipeline.stage import Inputs, Item, Record
 from stages.graphics.arrays import pack_json, unpack_json
+from stages.renderformer.evaluation.timing import STEPS, step_seconds
 from stages.renderformer.probes import edits
 from stages.renderformer.probes.probe import (
     HEADINGS,
@@ -81,10 +82,9 @@ class TimingConfig(ProbeConfig):
 class Timing(Probe):
     name = "timing"
     title = "Time by stage"
-    question = "What do the view-independent and the view-dependent stage cost, by number of triangles?"
+    question = "What do the steps of a picture cost, by number of triangles?"
     setting = "triangles"
     Config = TimingConfig
-    inside = True
 
     def items(self, config: TimingConfig, inputs: Inputs) -> Iterator[Item]:
         for scene_id in self.scene_ids(config, inputs):
@@ -96,11 +96,13 @@ class Timing(Probe):
         return edits.bisected(worker.base(scene_id), int(triangles))
 
     def process(self, worker: Worker, item: Item) -> Iterator[Record]:
-        from model.renderformer.flops import ENCODER_PARTS, forward_flops
+        from model.renderformer.architectures import architecture_of
+        from model.renderformer.flops import ENCODER_PARTS
         from stages.graphics.exr import encode_rgb
 
         config, scene = worker.config, self._scene(worker, item.id)
-        flops = forward_flops(worker.model.config, [len(scene.triangles)], 1, config.resolution, config.resolution)
+        network = worker.model.config
+        flops = architecture_of(network).flops(network, [len(scene.triangles)], 1, config.resolution, config.resolution)
         independent = sum(flops[name] for name in ENCODER_PARTS)
         facts = {
             "triangles": len(scene.triangles),
@@ -120,26 +122,28 @@ class Timing(Probe):
             gflops = {name: flops / 1e9 for name, flops in facts["flops"].items()}
             measured.setdefault(facts["triangles"], []).append(self._times(worker, self._scene(worker, row.id)) | gflops)
         means = {n: {k: float(np.mean([m[k] for m in rows])) for k in rows[0]} for n, rows in sorted(measured.items())}
-        columns = ["triangles", "view-independent (s)", "view-dependent (s)", "one picture (s)"]
+        steps = {name: step for name, step in STEPS.items() if name in next(iter(means.values()))}
+        columns = ["triangles", *(f"{step.label} (s)" for step in steps.values()), "one picture (s)"]
         columns += [f"each of {config.frames} frames (s)", "GFLOP, view-independent", "GFLOP, view-dependent"]
         columns += [f"path tracer, {config.tracer_spp} samples, denoised (s)"] if config.tracer_spp else []
         rows = [
             [
                 f"{n:,}",
-                *(f"{m[name]:.4f}" for name in ("encode", "decode", "total", "frame")),
+                *(f"{m[name]:.4f}" for name in (*steps, "total", "frame")),
                 *(f"{m[name]:.2f}" for name in ("view_independent", "view_dependent")),
                 *([f"{m['trace']:.3f}"] if config.tracer_spp else []),
             ]
             for n, m in means.items()
         ]
-        figure = new_figure(3.4)
+        figure = new_figure(3.8)
         left, right = figure.subplots(1, 2)
         labels, place = [f"{n:,}" for n in means], np.arange(len(means))
-        encode, decode, frame = (np.array([m[name] for m in means.values()]) for name in ("encode", "decode", "frame"))
-        left.bar(place - 0.2, encode, 0.38, color=COLOURS[0], label="view-independent")
-        left.bar(place - 0.2, decode, 0.38, bottom=encode, color=COLOURS[1], label="view-dependent")
-        left.bar(place + 0.2, frame, 0.38, color=COLOURS[2], label=f"each of {config.frames} frames, scene encoded once")
-        left.set(ylabel="seconds per picture")
+        below = np.zeros(len(means))
+        for (name, step), colour in zip(steps.items(), COLOURS, strict=False):
+            seconds = np.array([m[name] for m in means.values()])
+            left.bar(place, seconds, 0.6, bottom=below, color=colour, label=step.label)
+            below += seconds
+        left.set(ylabel="seconds of the first picture", ylim=(0, 1.7 * below.max()))
         lines = {"one picture": ("total", COLOURS[0]), f"each of {config.frames} frames": ("frame", COLOURS[2])}
         if config.tracer_spp:
             lines[f"path tracer, {config.tracer_spp} samples, denoised"] = ("trace", COLOURS[3])
@@ -154,22 +158,17 @@ class Timing(Probe):
         notes = [
             f"{config.resolution} px; {machine(worker, threads)}; the fastest of {config.repeats} after a warm-up. Triangles "
             "are cut in two until there are so many; the picture stays the same.",
-            "View-independent: reading the arrays and encoding; view-dependent: decoding one view. Frames: other cameras of a "
-            "static scene, encoded once, keys and values projected once.",
+            "Steps leave out reading the arrays, one picture does not. Frames: other cameras of a static scene, for which the "
+            "steps per scene are taken once.",
         ]
         return Outcome(columns, rows, figure, notes)
 
     def _times(self, worker: Worker, scene: SceneRecord) -> dict[str, float]:
-        """Seconds of the network's stages and of the path tracer on one scene."""
-        from model.renderformer.timing import time_steps
+        """Seconds of the network's steps and of the path tracer on one scene."""
         from model.timing import fastest
         from stages.renderformer.inference.predict import predict_scene
 
         config, model = worker.config, worker.model.eval()
-        batch = {name: array[None] for name, array in scene.arrays().items() if name not in ("patches", "patch_index")}
-        batch["mask"] = np.ones((1, len(scene.triangles)), bool)
-        batch |= {"camera_to_world": scene.camera_to_world[None], "fov_deg": scene.fov_deg[None]}
-        steps = time_steps(model, batch, config.resolution, worker.device, config.repeats)
 
         def predicted(views: int) -> float:
             return fastest(
@@ -178,12 +177,8 @@ class Timing(Probe):
                 config.repeats,
             )
 
-        times = {
-            "encode": steps["read"] + steps["encode"],
-            "decode": steps["project"] + steps["rays"] + steps["head"],
-            "total": predicted(1),
-            "frame": predicted(config.frames) / config.frames,
-        }
+        times = step_seconds(model, scene, 0, config.resolution, worker.device, config.repeats)
+        times |= {"total": predicted(1), "frame": predicted(config.frames) / config.frames}
         if config.tracer_spp:
             times["trace"] = fastest(
                 lambda: traced_picture(worker, scene, config.tracer_spp, denoised=True), "cpu", config.repeats
@@ -259,6 +254,7 @@ class EqualTime(Probe):
         facts = [unpack_json(draft.read(id, ("metrics.json",)).members["metrics.json"]) for id in ids]
         scene = worker.base(ids[0])
         model_s = fastest(lambda: worker.predict(scene), worker.device, config.repeats)
+        steps = step_seconds(worker.model.eval(), scene, 0, config.resolution, worker.device, config.repeats)
         traced_s = {
             (method, spp): fastest(lambda spp=spp, d=denoise: self._traced(worker, scene, spp, d), "cpu", config.repeats)
             for method, denoise in TRACED.items()
@@ -318,7 +314,8 @@ class EqualTime(Probe):
         notes = [
             f"{len(facts)} {config.split} scene(s) at {config.resolution} px; {machine(worker, threads)}; times of the first "
             f"scene, the fastest of {config.repeats} after a warm-up.",
-            f"The counts nearest to the network's {model_s:.3f} s: {ratios}.",
+            f"The network's {model_s:.3f} s by step: " + ", ".join(f"{STEPS[n].label} {t:.3f}" for n, t in steps.items()) + ".",
+            f"The counts nearest to them: {ratios}.",
             f"References: {span([fact['spp'] for fact in facts])} samples per pixel, every light denoised on its own. The path "
             "tracer's pictures have other random numbers, no path guiding, and are denoised as a whole.",
         ]

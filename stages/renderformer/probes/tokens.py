@@ -53,7 +53,11 @@ class Tokens(Probe):
     question = "Can a triangle's own light be read from its token, before a camera is known?"
     setting = "decoded from"
     Config = TokensConfig
-    inside = True
+
+    def refusal(self, model: Any) -> str | None:
+        if not model.reads_guides:
+            return None
+        return "a guided model is given each triangle's light in closed form, so that its tokens say nothing of what it learned"
 
     def items(self, config: TokensConfig, inputs: Inputs) -> Iterator[Item]:
         if config.fit_split == config.split:
