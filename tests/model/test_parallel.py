@@ -14,6 +14,7 @@ import torch
 from model.renderformer import checkpoint
 from model.renderformer.training import BEST, LAST
 from model.training.logs import LOG
+from tests.model.ranks import STEPS
 
 RANKS = Path(__file__).with_name("ranks.py")
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
@@ -28,14 +29,22 @@ def rows(folder: Path) -> list[dict]:
     return [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
 
 
-def test_two_processes_follow_one_and_share_its_checkpoints(tmp_path):
-    """50 steps alone; then 27 by two DDP processes with half the batch each, killed, and the rest by two FSDP processes."""
-    alone, shared = tmp_path / "alone", tmp_path / "shared"
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> tuple[Path, Path]:
+    """Trainings alone; and half by two DDP processes with half the batch each, killed, and the rest by two FSDP processes."""
+    folder = tmp_path_factory.mktemp("runs")
+    alone, shared = folder / "alone", folder / "shared"
     assert run(alone, "ddp", start=[sys.executable]).returncode == 0
-    assert run(shared, "ddp", 27, start=TORCHRUN).returncode != 0
-    assert rows(shared)[-1]["step"] == 27
+    assert run(shared, "ddp", "die", start=TORCHRUN).returncode != 0
+    assert [rows(shared / network)[-1]["step"] for network in STEPS] == [dies_at for dies_at, _ in STEPS.values()]
     resumed = run(shared, "fsdp", start=TORCHRUN)
     assert resumed.returncode == 0, resumed.stderr
+    return alone, shared
+
+
+@pytest.mark.parametrize("network", STEPS)
+def test_two_processes_follow_one_and_share_its_checkpoints(network, runs):
+    alone, shared = (folder / network for folder in runs)
     one, two = rows(alone), rows(shared)
     assert [row["step"] for row in one] == [row["step"] for row in two]
     for a, b in zip(one, two, strict=True):
@@ -44,4 +53,4 @@ def test_two_processes_follow_one_and_share_its_checkpoints(tmp_path):
     for name in (LAST, BEST):
         a, b = (checkpoint.load(folder / name)[0].state_dict() for folder in (alone, shared))
         assert all((a[key] - b[key]).abs().max() < 1e-3 for key in a)
-    assert torch.load(shared / "training.pt", weights_only=True)["plain"]["step"] == 50
+    assert torch.load(shared / "training.pt", weights_only=True)["plain"]["step"] == STEPS[network][1]

@@ -228,8 +228,6 @@ class TestBesideTheNetwork:
         weights = attention.cross_attention(model, scene, 16)
         assert weights.shape == (layers, 4, model.config.registers + len(scene.triangles))
         assert np.allclose(weights.sum(axis=-1), 1, atol=1e-5)
-            weights.sum(axis=-1), 1, atol=1e-5
-        )
         for row, (cross, given, out) in zip(weights, calls, strict=True):
             mixed = torch.from_numpy(row) @ given[2][0]  # one head: weights times values
             assert torch.allclose(cross.out_proj(merge_heads(mixed[None])), out, atol=1e-5)
