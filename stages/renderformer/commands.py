@@ -258,8 +258,8 @@ def add_commands(parsers: Any, program: str) -> None:
     def add_model_options(sub: argparse.ArgumentParser) -> None:
         sub.add_argument(
             "--checkpoint",
-            help="released-format folder, hub:OWNER/NAME, or a train artifact's key, name or 'train' (default: the model that "
-            "ships)",
+            help="released-format folder, hub:OWNER/NAME, ships:guided or ships:renderformer (default: the first of these that "
+            "ships), or a train artifact's key, name or 'train'",
         )
         sub.add_argument("--composite-lights", action="store_true", help="one pass per light, summed: for many lights")
         sub.add_argument("--device", default="auto", help="cpu, cuda or auto (default)")

@@ -208,7 +208,13 @@ def test_a_given_checkpoint_is_planned_without_a_cost(tmp_path):
     from pipeline.hydra_config import compose
     from pipeline.run import run_pipeline
 
-    words = ["stage=evaluate", "train=given", "train.checkpoint=model/pretrained", "plan=true", f"store={tmp_path}/s"]
+    words = [
+        "stage=evaluate",
+        "train=given",
+        "train.checkpoint=model/pretrained/renderformer",
+        "plan=true",
+        f"store={tmp_path}/s",
+    ]
     lines = []
     run_pipeline(compose(words), words, lines.append)
     text = "\n".join(lines)
@@ -300,18 +306,34 @@ def test_without_a_checkpoint_the_shipped_model_is_used(trained, shared_data, tm
     words = ["predict", str(scene), "-o", str(tmp_path / "out.png"), "--resolution", "16", "--device", "cpu"]
     monkeypatch.setattr(stages.renderformer.inference.renderer, "PRETRAINED", tmp_path / "none")
     assert main(words) == 2 and "no model ships" in capsys.readouterr().err
-    monkeypatch.setattr(stages.renderformer.inference.renderer, "PRETRAINED", trained[0].files / "checkpoint")
+    (tmp_path / "none").mkdir()
+    (tmp_path / "none" / "renderformer").symlink_to(trained[0].files / "checkpoint")
     assert main(words) == 0 and (tmp_path / "out.png").is_file()
+    assert main([*words, "--checkpoint", "ships:renderformer"]) == 0
+    assert main([*words, "--checkpoint", "ships:guided"]) == 2 and "choose from ships:renderformer" in capsys.readouterr().err
+
+
+def test_of_two_models_that_ship_the_guided_one_is_used(tmp_path, monkeypatch):
+    from stages.renderformer.inference import renderer
+
+    monkeypatch.setattr(renderer, "PRETRAINED", tmp_path)
+    for name in ("renderformer", "guided"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text("{}")
+    assert renderer.checkpoint_folder(None) == renderer.checkpoint_folder("ships:guided") == tmp_path / "guided"
+    assert renderer.checkpoint_folder("ships:renderformer") == tmp_path / "renderformer"
+    assert renderer.checkpoint_name(tmp_path / "guided") == "the guided model that ships"
+    assert renderer.checkpoint_name(tmp_path) == str(tmp_path)
 
 
 def test_what_ships_is_small_and_has_its_report():
-    from stages.renderformer.inference.renderer import PRETRAINED
+    from stages.renderformer.inference.renderer import PRETRAINED, shipped_checkpoints
 
-    if not (PRETRAINED / "config.json").is_file():
-        pytest.skip("no model ships yet")
-    load_model(PRETRAINED)
-    assert sum(path.stat().st_size for path in PRETRAINED.iterdir()) <= 50e6
-    assert "python -m pipeline" in (PRETRAINED / "report.md").read_text()
+    assert shipped_checkpoints()
+    for folder in shipped_checkpoints().values():
+        load_model(folder)
+        assert "python -m pipeline" in (folder / "report.md").read_text()
+    assert sum(path.stat().st_size for path in PRETRAINED.rglob("*") if path.is_file()) <= 10e6
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from stages.graphics.exr import encode_rgb
 from stages.graphics.geometry.records import MeshRecord, TextureRecord
 from stages.neuras.baking.site import write_site
 from stages.neuras.records import CaptureInfo, FrameRecord, PointsRecord, save
-from stages.renderformer.inference.renderer import PRETRAINED
+from stages.renderformer.inference.renderer import shipped_checkpoint
 from stages.renderformer.objects.rungs import rungs_record
 from stages.renderformer.s05_shard import merge
 from tests.neuras import scenes
@@ -102,7 +102,10 @@ def renderformer(root: Path) -> dict[str, Artifact]:
     card = {"card.html": b"<!doctype html><title>card</title><p>a card", "contact.png": png(3)}
     made["shard"] = commit(root, "shard", samples, {"scene": made["scene"], "render": made["render"]}, card)
     log = [{"step": step, "loss": 1 / step, "validation_psnr": 10.0 + step} for step in (1, 2, 3)]
-    files = {f"checkpoint/{name}": (PRETRAINED / name).read_bytes() for name in ("config.json", "model.safetensors")}
+    files = {
+        f"checkpoint/{name}": (shipped_checkpoint("renderformer") / name).read_bytes()
+        for name in ("config.json", "model.safetensors")
+    }
     files |= {"log.jsonl": "\n".join(map(json.dumps, log)).encode()}
     files |= {f"validation/step-{step:07}.png": png(step) for step in (1, 2, 3)}
     made["train"] = commit(root, "train", [], {"shard": made["shard"]}, files)

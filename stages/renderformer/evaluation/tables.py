@@ -30,9 +30,12 @@ def metrics_of(summaries: Collection[Mapping[str, Any]]) -> dict[str, Metric]:
 
 
 def verdicts(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """One sentence for each bar and judged metric, true or not; ``decided``: the interval leaves no doubt which."""
+    """One sentence for each bar and judged metric, true or not; ``decided``: the interval leaves no doubt which.
+
+    A model's own closed form, where it starts from one, is a bar here: what it learned is the gain over it.
+    """
     verdicts = []
-    for bar in BARS:
+    for bar in (*BARS, *({"closed_form"} & summary["gains"].keys())):
         for name in JUDGED:
             gain, metric = summary["gains"][bar][name], METRICS[name]
             mean, interval = format_estimate(metric, gain, "+")

@@ -140,7 +140,7 @@ def compare_scene(
 ) -> Comparison:
     """A comparison of one camera of a scene or mesh file: path traced with ``spp`` samples and denoised, and predicted."""
     from stages.graphics.mitsuba.backend import choose
-    from stages.renderformer.inference.renderer import PRETRAINED
+    from stages.renderformer.inference.renderer import checkpoint_name
     from stages.renderformer.rendering.render import render_views
     from stages.renderformer.rendering.settings import RenderSettings
 
@@ -155,7 +155,7 @@ def compare_scene(
     (traced,) = render_views(scene, RenderSettings(predicted.shape[:2], spp), choose("auto"), [view])
     names = (
         f"{path}, view {view}, path traced, {traced.meta['spp']} samples per pixel, denoised",
-        "the model that ships" if renderer.folder == PRETRAINED else str(renderer.folder),
+        checkpoint_name(renderer.folder),
     )
     notes = [*scene.meta.get("notes", ()), *(str(warning.message) for warning in caught)]
     try:

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from stages.renderformer.inference.output import Output
     from stages.renderformer.records import SceneRecord
 
-PRETRAINED = Path(__file__).resolve().parents[3] / "model" / "pretrained"  # the checkpoint that ships, if one does
+PRETRAINED = Path(__file__).resolve().parents[3] / "model" / "pretrained"  # a folder for each checkpoint that ships
+SHIPPED = ("guided", "renderformer")  # their names; the first that is there is used where none is named
+SHIPS = "ships:"  # begins a reference to one of them
 MAX_SIDE = 8192  # pixels
 
 
@@ -38,24 +40,40 @@ class LimitWarning(UserWarning):
 # --- checkpoints --------------------------------------------------------------------------------------------------------------
 
 
-def shipped_checkpoint() -> Path:
-    """The folder of the model that ships with the project."""
-    if not (PRETRAINED / "config.json").is_file():
+def shipped_checkpoints() -> dict[str, Path]:
+    """Name -> folder of the models that ship with the project, the one first that is used where none is named."""
+    return {name: PRETRAINED / name for name in SHIPPED if (PRETRAINED / name / "config.json").is_file()}
+
+
+def shipped_checkpoint(name: str | None = None) -> Path:
+    """The folder of the shipped model of that name; None: the first of `shipped_checkpoints`."""
+    shipped = shipped_checkpoints()
+    if not shipped:
         raise UserError(
             "no model ships with this version: train one (`make train`) and give --checkpoint train, or give "
             "--checkpoint FOLDER with a released checkpoint (config.json, model.safetensors)"
         )
-    return PRETRAINED
+    if name is not None and name not in shipped:
+        raise UserError(f"{SHIPS}{name} does not ship with this version: choose from {', '.join(map(SHIPS.__add__, shipped))}")
+    return shipped[name or next(iter(shipped))]
+
+
+def checkpoint_name(folder: Path) -> str:
+    """A checkpoint's folder for people."""
+    names = [name for name, shipped in shipped_checkpoints().items() if shipped == folder]
+    return f"the {names[0]} model that ships" if names else str(folder)
 
 
 def checkpoint_folder(reference: Path | str | None, store: Path | str = "store") -> Path:
     """The released-format folder of a checkpoint.
 
-    ``reference``: such a folder, ``hub:OWNER/NAME``, or a train artifact in the store. None: the model that ships. UserError:
-    it is neither.
+    ``reference``: such a folder, ``hub:OWNER/NAME``, ``ships:NAME``, or a train artifact in the store. None: the first model
+    that ships. UserError: it is none of these.
     """
     if reference is None:
         return shipped_checkpoint()
+    if str(reference).startswith(SHIPS):
+        return shipped_checkpoint(str(reference).removeprefix(SHIPS))
     if is_hub(reference):
         return hub_checkpoint(str(reference))
     folder = Path(reference)
@@ -83,8 +101,8 @@ def checkpoint_folder(reference: Path | str | None, store: Path | str = "store")
 class Renderer:
     """A trained network that renders scenes.
 
-    checkpoint: a released-format folder, ``hub:OWNER/NAME``, or a train artifact (``"train"``: the newest in ``store``). None:
-        the model that ships. device: cpu, cuda or auto.
+    checkpoint: a released-format folder, ``hub:OWNER/NAME``, ``ships:NAME`` (guided, renderformer), or a train artifact
+        (``"train"``: the newest in ``store``). None: the first model that ships. device: cpu, cuda or auto.
     triangles, resolution: most triangles of a scene, and pixels per side, that the checkpoint was trained with.
     """
 

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from stages.renderformer.inference.renderer import Renderer
 
 SUFFIXES = (*SCENES, *MESHES)
-SHIPPED = ""  # how the page names the model that ships
 MOST_SIDE, MOST_SPP, MOST_ASPECT = 2048, 4096, 8  # of one request
 SIZE_MULTIPLE = 8  # of the shorter side of a picture, where no model asks for another
 KEPT_MODELS = 3
@@ -49,20 +48,19 @@ def trained(shown: Shown) -> Iterator[Any]:
 
 
 def checkpoints(context: Context, arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The checkpoints at hand: the one given to the viewer first, then those of the store, the newest first, then the one
-    that ships. ``resolution``: pixels per side that it was trained with."""
-    from stages.renderformer.inference.renderer import PRETRAINED, checkpoint_folder
+    """The checkpoints at hand: the one given to the viewer first, then those of the store, the newest first, then those
+    that ship. ``resolution``: pixels per side that it was trained with."""
+    from stages.renderformer.inference.renderer import SHIPS, checkpoint_folder, checkpoint_name, shipped_checkpoints
 
     store = context.store.root if context.store is not None else "store"
     ids = [] if context.checkpoint is None else [context.checkpoint]
     if context.store is not None:
         ids += [made.name for made in reversed(context.store.artifacts("train")) if made.name != context.checkpoint]
     folders = {id: checkpoint_folder(id, store) for id in ids}
-    if (PRETRAINED / "config.json").is_file():
-        folders[SHIPPED] = PRETRAINED
+    shipped = {f"{SHIPS}{name}": folder for name, folder in shipped_checkpoints().items()}
     return [
-        {"id": id, "name": id or "the model that ships", "resolution": trained_resolution(folder)}
-        for id, folder in folders.items()
+        {"id": id, "name": checkpoint_name(folder) if id in shipped else id, "resolution": trained_resolution(folder)}
+        for id, folder in (folders | shipped).items()
     ]
 
 
@@ -88,7 +86,7 @@ def renderer(context: Context, checkpoint: Any) -> Renderer:
         store = context.store.root if context.store is not None else "store"
         while len(kept) >= KEPT_MODELS:
             kept.pop(next(iter(kept)))
-        kept[checkpoint] = Renderer(None if checkpoint == SHIPPED else checkpoint, context.device, store)
+        kept[checkpoint] = Renderer(checkpoint, context.device, store)
     return kept[checkpoint]
 
 
