@@ -16,7 +16,7 @@ from tests.conftest import ROOT
 
 def test_the_papers_tables_are_no_comparisons():
     assert ablation.names() == ["table1", "table1_small"] and experiments_of("renderformer").default == "table1_small"
-    with pytest.raises(UserError, match="table 'prior' is unknown: choose from default, priors, table1, table1_small"):
+    with pytest.raises(UserError, match="table 'prior' is unknown: choose from default, priors, shipped, table1, table1_small"):
         Table.of("renderformer", "prior")
     with pytest.raises(UserError, match="row x is unknown: choose from guided, renderformer"):
         Table.of("renderformer", "default").chosen(["x"])
