@@ -163,8 +163,8 @@ class Attention(Probe):
         side = worker.model.config.bundle_side
         notes = [
             f"{len(facts)} scene(s), {sum(len(fact['bundles']) for fact in facts)} ray bundles; weights averaged over heads. "
-            f"A scene has {triangles:,.0f} triangles on average and {registers} registers: spread evenly, the registers would "
-            f"get {100 * registers / (registers + triangles):.1f} %.",
+            f"A scene has {triangles:,.0f} triangles on average and {registers} registers"
+            + (f": spread evenly, they would get {100 * registers / (registers + triangles):.1f} %." if registers else "."),
             f"The bundle's own triangles are those that its {side} x {side} pixels see. Effective number of tokens: exp of the "
             "entropy.",
             "In the figure the square marks the bundle; a layer's picture shows the square root of the weight over the "
