@@ -89,7 +89,7 @@ def batches(job: Job, model: Any, arguments: argparse.Namespace) -> Callable[[in
 
 
 def jobs_of(table: str, names: list[str] | None) -> dict[str, Job]:
-    return dict((ablation if table in ablation.tables() else comparison).jobs_of(table, names, []))
+    return dict((ablation if table in ablation.names() else comparison).jobs_of(table, names, []))
 
 
 def main() -> int:
