@@ -490,7 +490,7 @@ def test_what_a_network_starts_from_is_scored_beside_it(inputs, predictor, tmp_p
     assert view["scores"]["closed_form"]["psnr"] < view["scores"]["model"]["psnr"]
     summary = json.loads(draft.file("metrics.json").read_text())
     assert summary["gains"]["closed_form"]["psnr"]["mean"] > 0 and "closed_form" in summary["regions"][0]["error"]
-    assert "closed form alone, nothing learned" in draft.file("metrics.md").read_text()
+    assert "beats the closed form alone, nothing learned in PSNR: gain +" in draft.file("metrics.md").read_text()
 
 
 class TestRegions:
