@@ -376,15 +376,17 @@ def test_pictures_that_are_not_square_are_predicted_and_have_attention(store):
     context = Context(Store(root))
     scene = SceneRecord.from_record(rf["scene"].read("test-000000"))
     camera = {"camera_to_world": scene.camera_to_world[0].tolist(), "fov_deg": 40.0, "aspect": 1.6}
-    request = {"scene": {"artifact": rf["scene"].name, "record": "test-000000"}, "checkpoint": "", "camera": camera}
+    shipped = "ships:renderformer"
+    request = {"scene": {"artifact": rf["scene"].name, "record": "test-000000"}, "checkpoint": shipped, "camera": camera}
     answer = models.predict(context, {**request, "resolution": 64})
     assert answer["image"].lights.shape == (1, 40, 64, 3)
     weights = models.attention(context, {**request, "resolution": 64, "pixel": [0.99, 0.99]})["weights"]
     assert weights.shape[1] == len(scene.triangles) and (weights.sum(axis=1) <= 1.001).all() and weights.any()
-    context.kept["renderers"][""] = SimpleNamespace(model=object())  # a network of another kind
+    blind = SimpleNamespace(gathering_layers=list)  # a network whose pixels look at no triangles
+    context.kept["renderers"][shipped] = SimpleNamespace(model=blind)
     with pytest.raises(UserError, match="no attention"):
         models.attention(context, {**request, "resolution": 64, "pixel": [0.5, 0.5]})
-    del context.kept["renderers"][""]
+    del context.kept["renderers"][shipped]
     with pytest.raises(UserError, match="aspect"):
         models.predict(context, {**request, "camera": {**camera, "aspect": 0}})
     scene.meta["aspect"] = [1.6] * len(scene.fov_deg)

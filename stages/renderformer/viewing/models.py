@@ -283,10 +283,10 @@ def attention(context: Context, arguments: Mapping[str, Any]) -> dict[str, Any]:
     model = renderer(context, arguments.get("checkpoint"))
     scene, side = edited_scene(context, arguments), resolution(arguments)
     x, y = numbers(arguments.get("pixel"), (2,), "pixel").clip(0, 1 - 1e-9)
-    if not hasattr(model.model, "view_transformer"):
-        raise UserError("this kind of network has no attention of pixels to show: choose a RenderFormer")
+    if not model.model.gathering_layers():
+        raise UserError("this network has no attention of pixels to show: choose another model")
     height, width = scene.picture_size(0, side, model.model.config.resolution_multiple)
-    rows, columns = (pixels // model.model.config.patch_size for pixels in (height, width))
+    rows, columns = (pixels // model.model.config.bundle_side for pixels in (height, width))
     bundle = int(y * rows) * columns + int(x * columns)
     weights = cross_attention(model.model, scene, (height, width), str(model.device))[:, bundle]
     registers = weights.shape[1] - len(scene.triangles)
