@@ -35,7 +35,7 @@ class RefineConfig(StageConfig):
     smoothness: float = Field(1.0, ge=0)  # weight of what neighbouring vertices' offsets differ by
     closeness: float = Field(0.02, gt=0)  # weight of offsets
     camera_closeness: float = Field(0.003, gt=0)  # weight of motions
-    least_gain: float = Field(0.01, ge=0, lt=1)  # share of the difference that must go, or nothing moves
+    least_gain: float = Field(0.05, ge=0, lt=1)  # share of the difference that must go, or nothing moves
 
     def settings(self) -> Settings:
         from stages.neuras.surfaces.photometric import Settings

@@ -61,7 +61,7 @@ class Settings:
     smoothness: float = 1.0
     closeness: float = 0.02
     camera_closeness: float = 0.003
-    least_gain: float = 0.01
+    least_gain: float = 0.05
 
 
 def refine(
