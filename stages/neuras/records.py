@@ -154,12 +154,12 @@ def posed(frames: Iterable[FrameRecord], poses: Poses) -> Iterator[FrameRecord]:
 
 
 def refined_poses(scaffold: Artifact) -> Poses:
-    """Of the training cameras that *refine* moved."""
+    """Of the cameras that *refine* moved."""
     return _poses(scaffold.read("mesh").members.get(POSES))
 
 
 def fitted_poses(fit: Artifact) -> Poses:
-    """Of the training cameras that a *fit* did not take as the capture has them."""
+    """Of the cameras that a *fit* does not take as the capture has them."""
     path = fit.path / "files" / POSES
     return _poses(path.read_bytes() if path.exists() else None)
 

@@ -1,8 +1,9 @@
 """Stage refine: the scaffold's vertices and the training cameras, moved until the photos agree.
 
-Reads a capture's training frames and the scaffold; writes one record "mesh" of the scaffold's shape, and beside it the poses
-of the frames whose cameras moved. Real cameras' poses are off by a pixel and more, and one texture shows the mean of what
-disagrees. ``stages.neuras.surfaces.photometric`` does it. Held-out frames keep their poses: they are not looked at.
+Reads a capture's training frames and the scaffold; writes one record "mesh" of the scaffold's shape, and beside it, where
+cameras moved, the poses of all frames. Real cameras' poses are off by a pixel and more, and one texture shows the mean of
+what disagrees. ``stages.neuras.surfaces.photometric`` does it. Held-out photos are not looked at: their cameras follow those
+beside them.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class RefineConfig(StageConfig):
     smoothness: float = Field(1.0, ge=0)  # weight of what neighbouring vertices' offsets differ by
     closeness: float = Field(0.02, gt=0)  # weight of offsets
     camera_closeness: float = Field(0.003, gt=0)  # weight of motions
-    least_gain: float = Field(0.01, ge=0, lt=1)  # share of the difference that must go, or nothing moves
+    least_gain: float = Field(0.05, ge=0, lt=1)  # share of the difference that must go, or nothing moves
 
     def settings(self) -> Settings:
         from stages.neuras.surfaces.photometric import Settings
@@ -68,19 +69,21 @@ class Refine(MapStage):
 
     def process(self, worker: Any, item: Item) -> Iterator[Record]:
         from stages.neuras.records import POSES, frames, scaffold_mesh
-        from stages.neuras.surfaces.photometric import Photo, refine
+        from stages.neuras.surfaces.photometric import Photo, follow, refine
 
         config, capture, scaffold = worker
         mesh, views, lines = scaffold_mesh(scaffold), list(frames(capture, "train")), []
-        cameras = [view.camera for view in views]
+        cameras = given = [view.camera for view in views]
         if (config.vertices or config.cameras) and len(views) > 1:
             photos = [Photo(view.camera, view.image(), view.counts()) for view in views]
             mesh, cameras = refine(mesh, photos, config.settings(), lines.append)
         arrays = pack_arrays({"vertices": mesh.vertices, "faces": mesh.faces})
         members = {"mesh.npz": arrays, "mesh.json": pack_json({"steps": lines})}
-        if config.cameras:
-            poses = {view.id: camera.camera_to_world.tolist() for view, camera in zip(views, cameras, strict=True)}
-            members[POSES] = pack_json(poses)
+        if cameras != given:
+            moved = {view.id: camera for view, camera in zip(views, cameras, strict=True)}
+            others = (frame for frame in frames(capture) if frame.id not in moved)
+            moved |= {frame.id: follow(frame.camera, given, cameras) for frame in others}
+            members[POSES] = pack_json({id: camera.camera_to_world.tolist() for id, camera in moved.items()})
         yield Record(item.id, members)
 
     def finish(self, config: RefineConfig, inputs: Inputs, draft: Draft) -> None:

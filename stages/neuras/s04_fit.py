@@ -1,7 +1,7 @@
 """Stage fit: textures, skyboxes, codebooks and both networks, learned once per scene (sections 3.1 to 3.3).
 
 Reads capture's training and validation frames and the atlas; writes ``model.safetensors`` and ``model.json`` (``Baked``),
-``poses.json`` (of the training cameras that *refine* moved), ``curve.csv`` and ``curve.png``, ``validation/`` (truth above,
+``poses.json`` (of the cameras that *refine* moved), ``curve.csv`` and ``curve.png``, ``validation/`` (truth above,
 ours below) and ``tensorboard/``. What each pixel sees of the mesh is cast anew in a run that goes on: 0.05 CPU-s a frame.
 The loop is ``model.neuras.fitting.fit``.
 """
@@ -143,7 +143,7 @@ class Fit(RunStage):
         poses = refined_poses(inputs["scaffold"])
         photos = list(posed(frames(inputs["capture"], "train"), poses))
         training = [_view(frame, atlas, caster) for frame in photos]
-        validation = [_view(frame, atlas, caster) for frame in frames(inputs["capture"], "validation")]
+        validation = [_view(frame, atlas, caster) for frame in posed(frames(inputs["capture"], "validation"), poses)]
         if not training:
             raise UserError("the capture has no training frame: look at its split")
         outputs = Outputs(

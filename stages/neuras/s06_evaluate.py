@@ -21,10 +21,10 @@ from stages.graphics.lpips_setting import NONE, LpipsSetting, lpips_networks
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.store import Artifact, Draft
+    from pipeline.store import Draft
     from stages.graphics.cameras import Camera
     from stages.neuras.evaluation.renderers import Scene
-    from stages.neuras.evaluation.views import Examiner
+    from stages.neuras.evaluation.views import Examiner, Photos
 
 
 class EvaluateConfig(StageConfig):
@@ -91,35 +91,34 @@ class Evaluate(MapStage):
             )
         return (Item(row.id, row.group) for row in rows)
 
-    def open(self, config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any]) -> tuple[Examiner, Artifact]:
+    def open(self, config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any]) -> tuple[Examiner, Photos]:
         import torch
 
         from stages.neuras.evaluation.renderers import Scene
         from stages.neuras.evaluation.scores import scorers
-        from stages.neuras.evaluation.views import Aligner, Examiner, Training, warping
+        from stages.neuras.evaluation.views import Aligner, Examiner, Photos, warping
 
         torch.set_num_threads(1)  # sums in another order round differently
         scene, capture = Scene.of(inputs), inputs["capture"]
         reference = scene.reference()
-        training = Training.of(capture, inputs["fit"])
+        photos = Photos(capture, inputs["fit"])
         examiner = Examiner(
             reference,
             {} if environment["opengl"] is None else {kind: scene.drawing(kind) for kind in ("fp16", "rgba8")},
-            warping(training, reference, scene.info.radius, config.warping_views),
+            warping(photos, reference, scene.info.radius, config.warping_views),
             scorers(lpips_networks(config.lpips), config.lpips_folder),
             config.depth_tolerance,
             config.exposure == "half",
-            Aligner(training, scene.atlas) if config.poses == "half" else None,
+            Aligner(photos, scene.atlas) if config.poses == "half" else None,
         )
-        return examiner, capture
+        return examiner, photos
 
-    def process(self, worker: tuple[Examiner, Artifact], item: Item) -> Iterator[Record]:
+    def process(self, worker: tuple[Examiner, Photos], item: Item) -> Iterator[Record]:
         from stages.graphics.arrays import pack_json
         from stages.graphics.page import png
-        from stages.neuras.records import FrameRecord
 
-        examiner, capture = worker
-        facts, pictures = examiner.examine(FrameRecord.from_record(capture.read(item.id)))
+        examiner, photos = worker
+        facts, pictures = examiner.examine(photos.read(item.id))
         yield Record(item.id, {"metrics.json": pack_json(facts), **{f"{name}.png": png(p) for name, p in pictures.items()}})
 
     def finish(self, config: EvaluateConfig, inputs: Inputs, draft: Draft) -> None:
@@ -128,11 +127,13 @@ class Evaluate(MapStage):
         from stages.neuras.evaluation import costs, drive, report
         from stages.neuras.evaluation.renderers import Scene
         from stages.neuras.evaluation.summary import summarise
-        from stages.neuras.records import frames
+        from stages.neuras.records import fitted_poses, frames, posed
 
         views = [unpack_json(draft.read(row.id, ("metrics.json",)).members["metrics.json"]) for row in draft.rows()]
         scene, site = Scene.of(inputs), inputs["bake"].file("site")
-        cameras = {frame.id: frame.camera for frame in frames(inputs["capture"], *config.splits)}
+        cameras = {
+            frame.id: frame.camera for frame in posed(frames(inputs["capture"], *config.splits), fitted_poses(inputs["fit"]))
+        }
         drawn_by = (draft.environment() or {})["opengl"]
         summary = summarise(views)
         summary["device"] = costs.device_bytes(scene.baked, scene.atlas)

@@ -7,14 +7,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.stage import Item, Record
+from stages.graphics.arrays import pack_arrays
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster
-from stages.neuras.records import Mesh
+from stages.graphics.page import png
+from stages.neuras.records import FrameRecord, Mesh, refined_poses
+from stages.neuras.s02_refine import Refine, RefineConfig
 from stages.neuras.surfaces import photometric
 from stages.neuras.surfaces.photometric import Photo, Settings
 
 POSITIONS = [(-0.8, -0.6, 4.0), (0.0, -0.8, 4.1), (0.8, -0.6, 4.0), (-0.5, 0.7, 4.0), (0.6, 0.6, 4.2)]
 SETTINGS = Settings(vertices=True, blurs=(2.0, 1.0), rounds=3, stride=1, smoothness=3.0, closeness=0.01)
+
+
+class Folder:
+    """An artifact of records, as stages read it."""
+
+    def __init__(self, *records: Record):
+        self.records = {record.id: record for record in records}
+
+    def rows(self) -> list[Record]:
+        return list(self.records.values())
+
+    def read(self, id: str) -> Record:
+        return self.records[id]
 
 
 def hills(side: int = 25) -> Mesh:
@@ -124,6 +141,39 @@ def test_a_held_out_photo_is_aligned_by_what_may_be_looked_at(truth):
     points = mesh.vertices[np.abs(mesh.vertices[:, :2]).max(axis=1) < 1].astype(float)
     away = [np.abs(one.project(points)[0] - photos[0].camera.project(points)[0]).mean() for one in (wrong.camera, camera)]
     assert away[1] < 0.25 * away[0]
+
+
+def test_a_camera_without_a_photo_follows_those_beside_it(truth):
+    _, photos = truth
+    before = [photo.camera for photo in photos]
+    same = [photometric.moved(camera, np.array([0.01, 0.02, -0.03, 0.1, 0.2, 0.3])) for camera in before]
+    led = photometric.follow(before[0].moved(np.array([0.1, 0.1, 0.0])), before, same)
+    wanted = photometric.moved(before[0].moved(np.array([0.1, 0.1, 0.0])), np.array([0.01, 0.02, -0.03, 0.1, 0.2, 0.3]))
+    assert np.allclose(led.camera_to_world, wanted.camera_to_world, atol=1e-9)
+    alone = [same[0], *before[1:]]
+    assert np.allclose(photometric.follow(before[0], before, alone).position, same[0].position, atol=2e-3)
+    assert np.allclose(photometric.follow(before[4], before, alone).camera_to_world, before[4].camera_to_world, atol=1e-3)
+
+
+def test_the_stage_moves_cameras_and_those_of_held_out_frames_with_them(truth):
+    mesh, photos = truth
+    scaffold = Folder(Record("mesh", {"mesh.npz": pack_arrays(vars(mesh))}))
+
+    def refined(photos: list[Photo]) -> dict[str, np.ndarray]:
+        """The training photos, and the first one once more as a test photo that shows nothing."""
+        pictures = [(f"frame-{n}", photo, photo.image, "train") for n, photo in enumerate(photos)]
+        pictures.append(("frame-held_out", photos[0], 0 * photos[0].image, "test"))
+        records = [FrameRecord(id, photo.camera, png(image), split).to_record() for id, photo, image, split in pictures]
+        (record,) = Refine().process((RefineConfig(stride=1, least_gain=0.5), Folder(*records), scaffold), Item("mesh"))
+        assert record.members["mesh.npz"] == scaffold.read("mesh").members["mesh.npz"]
+        return refined_poses(Folder(record))
+
+    assert refined(photos) == {}
+    wrong = shaken(photos)
+    poses, points = refined(wrong), mesh.vertices[np.abs(mesh.vertices[:, :2]).max(axis=1) < 1].astype(float)
+    cameras = [replace(photo.camera, camera_to_world=poses[f"frame-{n}"]) for n, photo in enumerate(wrong)]
+    assert off(cameras, photos, points) < 0.3 * off([photo.camera for photo in wrong], photos, points)
+    assert np.abs(poses["frame-held_out"] - poses["frame-0"]).max() < 1e-3
 
 
 def test_exposure_pulls_at_nothing(truth):

@@ -19,8 +19,8 @@ from pipeline.stage import Inputs
 from stages.graphics.metrics import Metric
 from stages.neuras.evaluation import paths
 from stages.neuras.evaluation.renderers import Scene, as_bytes
-from stages.neuras.evaluation.views import Training, warping
-from stages.neuras.records import frames
+from stages.neuras.evaluation.views import Photos, warping
+from stages.neuras.records import fitted_poses, frames, posed
 
 LEAST = 2  # images of a set: a covariance needs two
 TRUTH = "photo"  # the "method" whose pictures are the photos themselves
@@ -132,14 +132,14 @@ def imagined(
 ) -> tuple[dict[str, list[str]], Pictures]:
     """The same where nobody has photographed: the frames of ``splits``, moved by ``shifts`` (metres) to both sides."""
     reference = scene.reference()
-    training = Training.of(inputs["capture"], inputs["fit"])
-    warped = warping(training, reference, scene.info.radius, nearest)
+    photos = Photos(inputs["capture"], inputs["fit"])
+    warped = warping(photos, reference, scene.info.radius, nearest)
     cameras, sets = {}, {}
     for metres in shifts:
         sides: dict[str, list[str]] = {}
         for shift, side in ((-metres, "left"), (metres, "right")):
             sides[side] = []
-            for frame in frames(inputs["capture"], *splits):
+            for frame in posed(frames(inputs["capture"], *splits), fitted_poses(inputs["fit"])):
                 (cameras[key := f"{frame.id} {shift:+g}"],) = paths.beside([frame.camera], shift * scene.info.metre)
                 sides[side].append(key)
         sets |= {f"{metres:g} m to the {side}": keys for side, keys in sides.items()}

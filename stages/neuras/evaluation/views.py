@@ -18,7 +18,7 @@ from stages.neuras.baking.drawing import Drawing
 from stages.neuras.evaluation import scores
 from stages.neuras.evaluation.renderers import Reference, as_bytes
 from stages.neuras.evaluation.warping import Source, Warping
-from stages.neuras.records import AtlasMesh, FrameRecord, Mesh, Poses, fitted_poses, posed
+from stages.neuras.records import AtlasMesh, FrameRecord, Mesh, fitted_poses, posed
 from stages.neuras.surfaces import photometric
 
 GAIN = 4  # of a difference
@@ -26,33 +26,33 @@ LEAST = 0.01  # share of a view's pixels that its mask must leave
 CACHED = 8  # photos that a worker keeps for warping
 
 
-class Training:
-    """The training photos, each read when it is needed. Their cameras are those that the scene was fitted with."""
+class Photos:
+    """A capture's frames, each read when it is needed. Their cameras are those that the scene was fitted with.
 
-    def __init__(self, capture: Artifact, poses: Poses):
-        self._capture, self._poses = capture, poses
-        self._ids = capture.ids("train")
-        self.cameras = [self.frame(index).camera for index in range(len(self._ids))]
+    training: ids of the training frames; cameras: theirs, in that order.
+    """
 
-    @classmethod
-    def of(cls, capture: Artifact, fit: Artifact) -> Training:
-        return cls(capture, fitted_poses(fit))
+    def __init__(self, capture: Artifact, fit: Artifact):
+        self._capture, self._poses = capture, fitted_poses(fit)
+        self.training = capture.ids("train")
+        self.cameras = [self.read(id).camera for id in self.training]
 
-    def frame(self, index: int) -> FrameRecord:
-        return next(posed([FrameRecord.from_record(self._capture.read(self._ids[index]))], self._poses))
+    def read(self, id: str) -> FrameRecord:
+        return next(posed([FrameRecord.from_record(self._capture.read(id))], self._poses))
 
 
 class Aligner:
     """Finds where a held-out photo was taken from, by the nearest training photos and the mesh."""
 
-    def __init__(self, training: Training, mesh: AtlasMesh):
-        self._training, self._mesh = training, Mesh(mesh.vertices, mesh.faces)
+    def __init__(self, photos: Photos, mesh: AtlasMesh):
+        self._photos, self._mesh = photos, Mesh(mesh.vertices, mesh.faces)
         self._settings = photometric.Settings()
 
     def align(self, camera: Camera, image: np.ndarray, counts: np.ndarray) -> Camera:
         """``counts``: (H, W) bool, the pixels that may be looked at."""
-        near = photometric.nearest(self._training.cameras, camera.position, self._settings.neighbours)
-        photos = [photometric.Photo(f.camera, f.image(), f.counts()) for f in map(self._training.frame, near)]
+        near = photometric.nearest(self._photos.cameras, camera.position, self._settings.neighbours)
+        frames = [self._photos.read(self._photos.training[number]) for number in near]
+        photos = [photometric.Photo(frame.camera, frame.image(), frame.counts()) for frame in frames]
         return photometric.align(photometric.Photo(camera, image, counts), self._mesh, photos, self._settings)
 
 
@@ -107,16 +107,16 @@ class Examiner:
         return facts, {**pictures, "photo": photo, "difference": difference(photo, pictures["ours"], counts)}
 
 
-def warping(training: Training, reference: Reference, radius: float, nearest: int) -> Warping:
+def warping(photos: Photos, reference: Reference, radius: float, nearest: int) -> Warping:
     """Warping from the training photos."""
 
     @functools.lru_cache(CACHED)
     def source(index: int) -> Source:
-        frame = training.frame(index)
+        frame = photos.read(photos.training[index])
         image = frame.image().astype(np.float32) / 255
         return Source(frame.camera, image, frame.counts(), reference.caster.view(frame.camera))
 
-    return Warping(reference.caster, training.cameras, source, radius, nearest)
+    return Warping(reference.caster, photos.cameras, source, radius, nearest)
 
 
 def difference(photo: np.ndarray, picture: np.ndarray, counts: np.ndarray) -> np.ndarray:

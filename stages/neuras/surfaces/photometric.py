@@ -28,6 +28,7 @@ WINDOW = 3.0  # sigmas of the level: how wide the neighbourhood is that contrast
 WHOLE = 0.95  # share of the neighbourhood that must count
 ROBUST = 0.5  # of normalised luminance: larger differences count less and less (Geman-McClure)
 BEHIND = 0.01  # share of its distance that a point may lie behind the surface and still be seen
+FOLLOWED = 2  # cameras that one without a photo follows
 LONGEST = 3.0  # sigmas of the level that a step moves a vertex at most, in pixels
 
 
@@ -60,7 +61,7 @@ class Settings:
     smoothness: float = 1.0
     closeness: float = 0.02
     camera_closeness: float = 0.003
-    least_gain: float = 0.01
+    least_gain: float = 0.05
 
 
 def refine(
@@ -85,6 +86,18 @@ def refine(
         log("the photos agree as well without it: nothing is moved")
         return mesh, cameras
     return state.mesh, state.cameras
+
+
+def follow(camera: Camera, before: Sequence[Camera], after: Sequence[Camera]) -> Camera:
+    """``camera`` with the motion of the two nearest cameras of ``before``, which went to ``after``; the nearer weighs more.
+
+    Errors of poses change slowly along a drive, so a camera whose photo nobody looks at shares those of its neighbours.
+    """
+    near = nearest(before, camera.position, FOLLOWED)
+    away = np.array([np.linalg.norm(before[number].position - camera.position) for number in near])
+    weights = 1 / np.maximum(away, 1e-3 * max(away.max(), 1e-9))
+    motions = np.array([motion_between(before[number], after[number]) for number in near])
+    return moved(camera, weights @ motions / weights.sum())
 
 
 def align(photo: Photo, mesh: Mesh, photos: Sequence[Photo], settings: Settings) -> Camera:
@@ -328,6 +341,13 @@ def moved(camera: Camera, motion: np.ndarray) -> Camera:
     pose[:3, 3] += pose[:3, :3] @ motion[3:]
     pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(motion[:3]).as_matrix()
     return replace(camera, camera_to_world=pose)
+
+
+def motion_between(before: Camera, after: Camera) -> np.ndarray:
+    """(6,): what ``moved`` needs to get from one to the other."""
+    turn = before.camera_to_world[:3, :3].T
+    rotation = Rotation.from_matrix(turn @ after.camera_to_world[:3, :3]).as_rotvec()
+    return np.concatenate([rotation, turn @ (after.position - before.position)])
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
