@@ -13,6 +13,7 @@ lanes of a vector stay busy, and nothing is added by atomics. The host adds a pi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -20,12 +21,13 @@ import mitsuba as mi
 import numpy as np
 
 from stages.renderformer.records import SceneRecord
+from stages.renderformer.rendering.caustics import Film, LightPaths, narrow_triangles
 from stages.renderformer.rendering.guiding import Guide, Trail, Unguided
 from stages.renderformer.rendering.lights import SLOTS, LightTable
 from stages.renderformer.rendering.material import Material
 from stages.renderformer.rendering.sobol import Sampler, mixed
 from stages.renderformer.rendering.sums import Sums
-from stages.renderformer.rendering.surfaces import Surfaces, gatherable, shape_mesh
+from stages.renderformer.rendering.surfaces import Surfaces, gatherable, mesh_of, shape_mesh
 
 BLOCKS = (8, 64)  # samples of a lane, least and most
 LANES = 1 << 15  # of a view: enough to keep processors busy, so that lanes take more samples each
@@ -76,6 +78,7 @@ class Cameras:
         self.pose = gatherable(scene.camera_to_world[:, :3].reshape(-1, 12))
         self.focal = gatherable(0.5 / np.tan(0.5 * np.radians(scene.fov_deg.astype(np.float64))))  # image height 1
         self.filter = gatherable(filter_offsets(filter_name))
+        self.pixels = size[0] * size[1]  # of a view
         self.height, self.width = (dr.opaque(mi.UInt32, side) for side in size)
         self.aspect = dr.opaque(mi.Float, size[1] / size[0])
 
@@ -93,6 +96,23 @@ class Cameras:
             *[entry[4 * axis] * local.x + entry[4 * axis + 1] * local.y + entry[4 * axis + 2] * local.z for axis in range(3)]
         )
         return mi.Ray3f(mi.Point3f(entry[3], entry[7], entry[11]), dr.normalize(direction))
+
+    def project(self, view: mi.UInt32, point: mi.Point3f) -> tuple[mi.Point3f, mi.UInt32, mi.Float]:
+        """The camera's position, the pixel (row by row) of the view in which it sees ``point``, and how many pixels an area
+        about the point that faces the camera covers, over that area; 0 where it is out of the picture. For a box filter."""
+        entry = [dr.gather(mi.Float, self.pose, 12 * view + index) for index in range(12)]
+        eye = mi.Point3f(entry[3], entry[7], entry[11])
+        way = point - eye
+        right, up, back = (mi.Vector3f(entry[axis], entry[4 + axis], entry[8 + axis]) for axis in range(3))
+        depth = -dr.dot(back, way)
+        height, width = mi.Float(self.height), mi.Float(self.width)
+        scale = dr.gather(mi.Float, self.focal, view) * height
+        column = dr.dot(right, way) / depth * scale + 0.5 * width
+        row = 0.5 * height - dr.dot(up, way) / depth * scale
+        inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        pixel = mi.UInt32(dr.select(inside, row, 0)) * self.width + mi.UInt32(dr.select(inside, column, 0))
+        distance2 = dr.squared_norm(way)
+        return eye, pixel, dr.select(inside, scale * scale * dr.sqrt(distance2) / (depth * depth * depth), 0)
 
     def _offset(self, u: mi.Float) -> mi.Float:
         u = u * FILTER_CELLS
@@ -128,12 +148,13 @@ def _add(slots: list, slot: mi.Int32, value: mi.Color3f) -> list:
 
 
 @dr.syntax
-def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start, guide):
+def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start, divided, guide):
     """Sums over the samples of each lane: (light slots, direct, albedo, normal, distance, hits, nearest distance, triangle).
 
     ``limits``: opaque (bounces, diffuse bounces, glossy bounces, indirect clamp on the sum over RGB). ``hide``: opaque
     bool, camera rays pass through lights. The triangle is that of the first sample, -1 where it hit nothing.
-    ``diffuse_start``: the first surface is a white diffuse one, whatever its material. ``guide`` learns, and picks directions.
+    ``diffuse_start``: the first surface is a white diffuse one, whatever its material. ``divided``: light
+    paths bring what belongs to them (``caustics``). ``guide`` learns, and picks directions.
     """
     max_bounces, max_diffuse, max_glossy, clamp = limits
     slots = [mi.Color3f(0) for _ in range(SLOTS)]
@@ -147,6 +168,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
     fresh = mi.Bool(True)
     throughput, bsdf_pdf, widest = mi.Color3f(1), mi.Float(0), mi.Float(dr.inf)  # widest: least density so far
     bounce, diffuse, glossy = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+    # shares of the throughput that the first surface's wide part gave, and of it the last surface's narrow part
+    wide, theirs = mi.Color3f(0), mi.Color3f(0)
     trail = Trail.none()
 
     while done < lanes.count:
@@ -182,6 +205,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         light_pdf = dr.gather(mi.Float, lights.density, si.prim_index, hit) * si.t * si.t / dr.maximum(cosine, 1e-9)
         weight = dr.select(bounce == 0, 1, mis_weight(bsdf_pdf, light_pdf))
         value = throughput * dr.gather(mi.Color3f, lights.emission, si.prim_index, hit) * weight
+        if divided:
+            value *= 1 - theirs
         value = dr.select(hit, clamped(value, dr.select(bounce > 1, clamp, dr.inf)), 0)
         slots = _add(slots, slot, value)
         direct += dr.select(bounce <= 1, value, 0)
@@ -205,7 +230,10 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         cosine = dr.abs(dr.dot(dr.gather(mi.Normal3f, lights.normal, lit), to_light))
         density = dr.gather(mi.Float, lights.density, lit)
         sampled = surface & (cosine > 0) & (distance2 > 0) & (density > 0)
-        reflected, pdf = material.evaluate(lobes, si.wi, si.to_local(to_light))
+        dull, bright, pdf = material.evaluate_lobes(lobes, si.wi, si.to_local(to_light))
+        reflected = dull + bright
+        if divided:
+            reflected = dull + bright * dr.select(lobes.is_narrow, 1 - wide, 1)
         sampled &= dr.max(reflected) > 0
         sampled &= ~scene.ray_test(shadow, sampled)
         light_pdf = density * distance2 / dr.maximum(cosine, 1e-9)
@@ -220,7 +248,12 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         within = sampler.two(dimension + DIRECTION)
         wo, is_glossy = material.sample(lobes, si.wi, choice.y, within)
         wo = guide.direction(wo, spot, si, sampler.two(dimension + GUIDE), within)
-        scattered, pdf = material.evaluate(lobes, si.wi, wo)
+        dull, bright, pdf = material.evaluate_lobes(lobes, si.wi, wo)
+        scattered = dull + bright
+        if divided:
+            narrow = dr.select(lobes.is_narrow & (scattered > 0), bright / scattered, 0)
+            theirs = dr.select(surface, wide * narrow, theirs)
+            wide = dr.select(surface & (bounce == 0), 1 - narrow, wide)
         direction, arriving = si.to_world(wo), mi.Color3f(throughput)
         pdf = guide.density(pdf, spot, direction)
         glossy += dr.select(surface & is_glossy, 1, 0)
@@ -240,6 +273,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         done += dr.select(fresh, 1, 0)
         throughput, bsdf_pdf = dr.select(fresh, 1, throughput), dr.select(fresh, 0, bsdf_pdf)
         widest = dr.select(fresh, dr.inf, widest)
+        if divided:
+            wide, theirs = dr.select(fresh, 0, wide), dr.select(fresh, 0, theirs)
         trail = guide.step(trail, spot, direction, arriving, fresh)
         bounce, diffuse, glossy = [dr.select(fresh, 0, count) for count in (bounce, diffuse, glossy)]
 
@@ -262,7 +297,14 @@ class JitRenderer:
     """One scene, ready to be seen from its cameras."""
 
     def __init__(
-        self, scene: SceneRecord, size: tuple[int, int], seed: int, limits: Limits, lights_visible: bool, guided: bool = False
+        self,
+        scene: SceneRecord,
+        size: tuple[int, int],
+        seed: int,
+        limits: Limits,
+        lights_visible: bool,
+        guided: bool = False,
+        light_paths: bool = False,
     ):
         self.record, self.size, self.seed = scene, size, seed  # (height, width)
         self.pixels = size[0] * size[1]  # of a view
@@ -274,6 +316,12 @@ class JitRenderer:
         self.guided = guided
         self.guides = [Guide(scene) if guided else Unguided() for _ in self.passes]
         self.cameras = Cameras(scene, size, limits.filter)
+        self.light_paths = None
+        if light_paths and limits.bounces > 1 and scene.n_lights and len(narrow_triangles(surfaces)[0]):
+            self.light_paths = LightPaths(scene, surfaces, self.passes, seed)
+            hidden = scene.light_index >= 0 if not lights_visible else np.zeros(len(scene.light_index), bool)
+            seen = mesh_of(scene.triangles[~hidden], None)
+            self.before_cameras = mi.load_dict({"type": "scene", "surface": seen})
 
     def learn(self, views: list[int]) -> None:
         """Guide the paths of these views from now on by what those so far have brought."""
@@ -307,6 +355,15 @@ class JitRenderer:
             [Sums(spp, **{name: image[stream, view] for name, image in images.items()}) for view in range(len(views))]
             for stream in range(len(streams))
         ]
+
+    def light(self, views: list[int], stream: int, windows: Sequence[tuple[int, int]]) -> list[np.ndarray]:
+        """Per view, the caustics (L, H, W, 3) of the stream's light paths from the first to the last but one of its window."""
+        lights = []
+        for number, table in enumerate(self.passes):
+            film = Film(self.cameras, self.before_cameras, table.slots, views, np.asarray(windows))
+            self.light_paths.add(number, self.scene, self.material, film, stream, self.limits.bounces)
+            lights.append(film.light().reshape(len(views), table.slots, *self.size, 3))
+        return list(np.concatenate(lights, axis=1))
 
     def _pass(
         self,
@@ -377,8 +434,9 @@ class JitRenderer:
         hide = dr.opaque(mi.Bool, not self.lights_visible)
         pass_key = opaque(number * 0x5851F42D)
         white = isinstance(rays, Points)
+        divided = self.light_paths is not None and not white
         guide = Unguided() if white else self.guides[number]
-        out = trace_paths(self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, guide)
+        out = trace_paths(self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, divided, guide)
         dr.eval(out)
         slots, *wide, distances, hits, nearest, triangle = out
         size = len(pixel)
