@@ -1,7 +1,8 @@
 """Six views full of caustics, made by code alone: what path tracing from the camera finds dear.
 
 Four are drawn by the released law with its special shapes made mirror-like (roughness 0.03 to 0.12). One has a glossy tree
-over a mirror-like floor, one a thick gold ring on a table. ``scenes()`` gives them as SceneRecords of one camera each.
+over a mirror-like floor before rough walls, one a thick gold ring on a table. ``scenes()`` gives them as SceneRecords of one
+camera each; lamps, walls and places are drawn.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ MIRROR_LIKE = {  # name: template, shape, its resolution, roughness, smooth
     "cylinder": ("floor", "cylinder", 8, 0.03, False),
     "cone": ("corner", "cone", 8, 0.12, True),
 }
+FIELDS = {"cylinder": 32.0, "ring": 26.0}  # of view, degrees; 42 else
 NAMES = (*MIRROR_LIKE, "tree", "ring")
 
 
@@ -32,7 +34,9 @@ def scenes() -> dict[str, SceneRecord]:
 def scene(name: str) -> SceneRecord:
     """One of ``NAMES``."""
     laws, seed = Laws(), NAMES.index(name)
-    template, shape, resolution, roughness, smooth = MIRROR_LIKE.get(name, ("floor", "torus", 12, 0.05, True))
+    template, shape, resolution, roughness, smooth = MIRROR_LIKE.get(
+        name, ("corner" if name == "tree" else "floor", "torus", 12, 0.05, True)
+    )
     none = dict.fromkeys(WeightLaw().model_dump(), 0.0)
     only = laws.model_copy(update={"weights": WeightLaw(**none | {f"{template}_special": 1.0})})
     plan = draw_plan(only, np.random.default_rng(seed), 1)
@@ -47,6 +51,13 @@ def scene(name: str) -> SceneRecord:
     if name == "ring":
         floor.rotation_deg, floor.translation = [0.0, 0.0, 0.0], [0.0, 0.0, 0.3]
         item.rotation_deg, item.scale, item.translation = [0.0, 0.0, 0.0], [1.1, 1.1, 1.6], [0.0, 0.0, -0.44]
+    plan.cameras[0] = replace(
+        plan.cameras[0],
+        position=[-1.0, -1.45, 0.7],
+        look_at=[0.0, 0.0, -0.1],
+        up=[0.0, 0.0, 1.0],
+        fov_deg=FIELDS.get(name, 42.0),
+    )
     record = assemble(name, plan, [mesh], [{}], laws.material, {"law": "caustics"})
     if name == "ring":
         gold = (record.specular > 0.8).all(axis=1) & (record.light_index < 0)

@@ -32,33 +32,45 @@ LANE = 32  # paths of a lane, one after another
 CHUNK = 1 << 22  # paths in flight
 UNIT = 2.0**-12  # of the whole numbers that light adds up in; a pixel of radiance 1 gets one whole per path
 BRIGHTEST = 2.0**30  # a contribution counts as this much at most, before the division by the number of paths
-LEAST_COSINE = 0.1  # of what decides where paths start: a triangle's centre does not tell of all of it
+# Where paths start is decided by probes of single points, which do not tell of all of a triangle.
+PROBES = 1 << 17  # of a pass over the lights
+LEAST_COSINE = 0.1
+ESCAPES, UNSEEN = 0.1, 0.02  # what a probe counts that leaves the scene behind the triangle, or does not get to it
 # Dimensions of a vertex for the sampler; those of the start come before.
 PAIR, LIGHT_POINT, POINT, START = range(4)
 LOBE, DIRECTION, ROULETTE, DIMENSIONS = range(4)
 
 
 class Starts:
-    """Where light paths start: for each light of a pass, the narrow triangles by the light that they get from it.
+    """Where light paths start: for each light of a pass, the narrow triangles by how much of its light they send on.
 
-    ``narrow``: (N,) indices of triangles with a narrow part somewhere; ``weight``: (N,) how much of the light goes on there.
+    ``narrow``: (N,) indices of triangles with a narrow part somewhere; ``bright``: (N,) how much that reflects at most.
     """
 
-    def __init__(self, scene: SceneRecord, first: int, lights: LightTable, narrow: np.ndarray, weight: np.ndarray):
+    def __init__(self, scene: SceneRecord, mitsuba_scene: mi.Scene, first: int, slots: int, narrow: np.ndarray, bright: np.ndarray):
         corners = scene.triangles.astype(np.float64)
         cross = normal_vectors(corners)
         length = np.linalg.norm(cross, axis=1)
-        normal, centre = cross / np.maximum(length, 1e-30)[:, None], corners.mean(axis=1)
-        shares = np.zeros((lights.slots, len(narrow)))
-        for slot in range(lights.slots):
-            for lamp in np.flatnonzero(scene.light_index == first + slot):
-                way = centre[narrow] - centre[lamp]
+        normal = cross / np.maximum(length, 1e-30)[:, None]
+        shares = np.zeros((slots, len(narrow)))
+        probes = int(np.clip(PROBES // (slots * len(narrow)), 1, 8))
+        rng = np.random.default_rng(first)
+        for slot in range(slots):
+            lamps = np.flatnonzero(scene.light_index == first + slot)
+            power = scene.emission[lamps].sum(axis=1, dtype=np.float64) * length[lamps]
+            if not power.sum() > 0:
+                continue
+            lamp = rng.choice(lamps, len(narrow), p=power / power.sum())
+            received = np.zeros(len(narrow))
+            for _ in range(probes):
+                start, point = (_inside(corners[faces], rng) for faces in (lamp, narrow))
+                way = point - start
                 distance2 = np.maximum((way**2).sum(axis=1), length[lamp])
                 way /= np.sqrt(distance2)[:, None]
-                leaving = np.maximum(np.abs(way @ normal[lamp]), LEAST_COSINE)
-                arriving = np.maximum(np.abs((way * normal[narrow]).sum(axis=1)), LEAST_COSINE)
-                power = float(scene.emission[lamp].sum()) * length[lamp]
-                shares[slot] += power * leaving * arriving / distance2 * length[narrow] * weight
+                cosines = [np.abs((way * normal[faces]).sum(axis=1)) for faces in (lamp, narrow)]
+                leaving, arriving = (np.maximum(cosine, LEAST_COSINE) for cosine in cosines)
+                received += leaving * arriving / distance2 * _prospects(mitsuba_scene, start, point, narrow)
+            shares[slot] = received * length[narrow] * bright
         total = shares.sum(axis=1, keepdims=True)
         cumulative = np.cumsum(shares / np.where(total > 0, total, 1), axis=1).astype(np.float32)
         cumulative[:, -1:] = np.where(total > 0, 1, 0)
@@ -89,6 +101,24 @@ class Starts:
             low = dr.select(over, low, dr.minimum(middle + 1, high))
             step += 1
         return low
+
+
+def _inside(corners: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(N, 3) points spread evenly over (N, 3, 3) triangles."""
+    u, v = rng.random((2, len(corners), 1))
+    root = np.sqrt(u)
+    return corners[:, 0] * (1 - root) + corners[:, 1] * (root * (1 - v)) + corners[:, 2] * (root * v)
+
+
+def _prospects(scene: mi.Scene, start: np.ndarray, point: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(N,) what light from (N, 3) starts to points on the triangles ``faces`` promises: that it gets there, and that what a
+    mirror sends on meets a surface. Never nothing: it is one probe of a whole triangle."""
+    start, point = (mi.Point3f(*(gatherable(axis) for axis in places.T)) for places in (start, point))
+    way = point - start
+    si = scene.ray_intersect(mi.Ray3f(start + way * 1e-4, dr.normalize(way)), mi.RayFlags.ShadingFrame, False)
+    arrives = si.is_valid() & (si.prim_index == gatherable(faces, mi.UInt32))
+    meets = arrives & scene.ray_test(si.spawn_ray(si.to_world(mi.reflect(si.wi))), arrives)
+    return dr.select(meets, 1, dr.select(arrives, ESCAPES, UNSEEN)).numpy()[: len(faces)]
 
 
 class Film:
@@ -191,14 +221,15 @@ def trace_light(scene, lights, starts, material, film, key, first, count, max_bo
         done += dr.select(fresh, 1, 0)
 
 
-
 class LightPaths:
     """A scene's light paths."""
 
-    def __init__(self, scene: SceneRecord, surfaces: Surfaces, passes: Sequence[LightTable], seed: int):
-        narrow, weight = narrow_triangles(surfaces)
+    def __init__(self, scene: SceneRecord, mitsuba_scene: mi.Scene, surfaces: Surfaces, passes: Sequence[LightTable], seed: int):
+        narrow, bright = narrow_triangles(surfaces)
         self.seed, self.passes = seed, passes
-        self.starts = [Starts(scene, SLOTS * number, table, narrow, weight) for number, table in enumerate(passes)]
+        self.starts = [
+            Starts(scene, mitsuba_scene, SLOTS * number, table.slots, narrow, bright) for number, table in enumerate(passes)
+        ]
 
     def add(self, number: int, scene: mi.Scene, material: Material, film: Film, stream: int, bounces: int) -> None:
         """Join the stream's paths of the film's windows, in pass ``number`` over the lights, to the film's cameras."""

@@ -318,7 +318,7 @@ class JitRenderer:
         self.cameras = Cameras(scene, size, limits.filter)
         self.light_paths = None
         if light_paths and limits.bounces > 1 and scene.n_lights and len(narrow_triangles(surfaces)[0]):
-            self.light_paths = LightPaths(scene, surfaces, self.passes, seed)
+            self.light_paths = LightPaths(scene, self.scene, surfaces, self.passes, seed)
             hidden = scene.light_index >= 0 if not lights_visible else np.zeros(len(scene.light_index), bool)
             seen = mesh_of(scene.triangles[~hidden], None)
             self.before_cameras = mi.load_dict({"type": "scene", "surface": seen})
@@ -436,7 +436,9 @@ class JitRenderer:
         white = isinstance(rays, Points)
         divided = self.light_paths is not None and not white
         guide = Unguided() if white else self.guides[number]
-        out = trace_paths(self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, divided, guide)
+        out = trace_paths(
+            self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, divided, guide
+        )
         dr.eval(out)
         slots, *wide, distances, hits, nearest, triangle = out
         size = len(pixel)

@@ -101,9 +101,7 @@ class Material:
         diffuse, specular, density = self.evaluate_lobes(lobes, wi, wo)
         return diffuse + specular, density
 
-    def evaluate_lobes(
-        self, lobes: Lobes, wi: mi.Vector3f, wo: mi.Vector3f
-    ) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
+    def evaluate_lobes(self, lobes: Lobes, wi: mi.Vector3f, wo: mi.Vector3f) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
         """As `evaluate`, with the diffuse and the specular lobe's part of the first apart."""
         side = dr.select(wi.z < 0, -1, 1)  # seen from below: the same material
         wi, wo = mi.Vector3f(wi.x, wi.y, wi.z * side), mi.Vector3f(wo.x, wo.y, wo.z * side)
