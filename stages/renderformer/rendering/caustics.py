@@ -8,8 +8,8 @@ one technique and full weight, so the sum is exact whatever was sampled.
 
 A light path picks a lamp's triangle by power and a triangle with a narrow part by the light that it gets from there, unless
 something stands between. It goes on as from a camera, and at each wide vertex adds its light to the pixel of every view that
-sees the vertex. Each view counts the path numbers of a window of its own, so that its bytes do not depend on the other views. What
-is added up are whole numbers: neither threads nor chunks change the bytes.
+sees the vertex. Each view counts the path numbers of a window of its own, so that its bytes do not depend on the other views.
+What is added up are whole numbers: neither threads nor chunks change the bytes.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ class Starts:
     ``narrow``: (N,) indices of triangles with a narrow part somewhere; ``bright``: (N,) how much that reflects at most.
     """
 
-    def __init__(self, scene: SceneRecord, mitsuba_scene: mi.Scene, first: int, slots: int, narrow: np.ndarray, bright: np.ndarray):
+    def __init__(
+        self, scene: SceneRecord, mitsuba_scene: mi.Scene, first: int, slots: int, narrow: np.ndarray, bright: np.ndarray
+    ):
         corners = scene.triangles.astype(np.float64)
         cross = normal_vectors(corners)
         length = np.linalg.norm(cross, axis=1)
@@ -224,7 +226,9 @@ def trace_light(scene, lights, starts, material, film, key, first, count, max_bo
 class LightPaths:
     """A scene's light paths."""
 
-    def __init__(self, scene: SceneRecord, mitsuba_scene: mi.Scene, surfaces: Surfaces, passes: Sequence[LightTable], seed: int):
+    def __init__(
+        self, scene: SceneRecord, mitsuba_scene: mi.Scene, surfaces: Surfaces, passes: Sequence[LightTable], seed: int
+    ):
         narrow, bright = narrow_triangles(surfaces)
         self.seed, self.passes = seed, passes
         self.starts = [

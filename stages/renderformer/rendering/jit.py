@@ -13,7 +13,6 @@ lanes of a vector stay busy, and nothing is added by atomics. The host adds a pi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -356,14 +355,16 @@ class JitRenderer:
             for stream in range(len(streams))
         ]
 
-    def light(self, views: list[int], stream: int, windows: Sequence[tuple[int, int]]) -> list[np.ndarray]:
-        """Per view, the caustics (L, H, W, 3) of the stream's light paths from the first to the last but one of its window."""
+    def add_caustics(self, sums: list[Sums], views: list[int], stream: int, windows: list[tuple[int, int]]) -> None:
+        """Add to the sums of each of the ``views`` what the stream's light paths bring, from the first to the last but one of
+        the view's window."""
         lights = []
         for number, table in enumerate(self.passes):
             film = Film(self.cameras, self.before_cameras, table.slots, views, np.asarray(windows))
             self.light_paths.add(number, self.scene, self.material, film, stream, self.limits.bounces)
             lights.append(film.light().reshape(len(views), table.slots, *self.size, 3))
-        return list(np.concatenate(lights, axis=1))
+        for of_view, caustics, (first, last) in zip(sums, np.concatenate(lights, axis=1), windows, strict=True):
+            of_view.caustics, of_view.paths = of_view.caustics + caustics, of_view.paths + last - first
 
     def _pass(
         self,

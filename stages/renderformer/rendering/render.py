@@ -21,6 +21,7 @@ from pipeline.errors import UserError
 from stages.graphics.denoising import denoise as denoise_layer
 from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.records import SceneRecord, ViewRecord
+from stages.renderformer.rendering.allotment import Allotment
 from stages.renderformer.rendering.error import Judge
 from stages.renderformer.rendering.settings import RenderSettings
 from stages.renderformer.rendering.sums import Sums
@@ -55,12 +56,17 @@ def render_views(
     step = min(FIRST_SPP // 2, total) if len(streams) > 1 else total
     parts: dict[int, list[Sums]] = {view: [] for view in active}  # per stream
     judges = {view: Judge(target_error, denoise) for view in active}
+    allotments = {view: Allotment(settings.size) for view in active}
     due = dict.fromkeys(active, 0.0)  # samples of a stream before which an estimate is not worth its cost
     while active:
         if sampled_spp:
             renderer.learn(active)
         sampled = renderer.sample(active, streams, sampled_spp, step)
         sampled_spp += step
+        if renderer.light_paths:
+            windows = [allotments[view].window(sampled_spp) for view in active]
+            for stream, of_views in zip(streams, sampled, strict=True):
+                renderer.add_caustics(of_views, active, stream, windows)
         unfinished = []
         for view, new in zip(active, zip(*sampled, strict=True), strict=True):
             of_streams = parts[view] = (
@@ -73,6 +79,7 @@ def render_views(
             all_samples, *halves = (part.view(scene.object_index) for part in (sums, *of_streams))
             quality, error = "high" if denoise else None, None
             if len(halves) > 1:
+                allotments[view].weigh(*of_streams)
                 quality, error = judges[view].error(*halves, all_samples)
             if sampled_spp == total or error is None or error <= target_error:
                 records[view] = _finish(all_samples, sums, view, quality, error, len(streams) * sampled_spp - sums.spp)
@@ -80,7 +87,8 @@ def render_views(
                 continue
             unfinished.append(view)
             if renderer.guided and sampled_spp == step and total >= 2 * sampled_spp and error > FAR * target_error:
-                parts[view] = []  # guided samples are so much better that these would only harm
+                # guided samples are so much better that these would only harm
+                parts[view] = [part.without_camera_paths() for part in of_streams]
             else:  # no error falls faster than by the square root, and denoised ones do not reach it
                 due[view] = sampled_spp + ((error / target_error) ** (2.5 if denoise else 2.0) - 1) * of_streams[0].spp
         active, step = unfinished, min(_next(sampled_spp) - sampled_spp, total - sampled_spp)
@@ -108,7 +116,7 @@ def _renderer(scene: SceneRecord, settings: RenderSettings, backend: dict[str, A
 
     if settings.mode == "physical":
         guided = settings.target_error > 0 and settings.max_spp > FIRST_SPP  # else there is no second portion to guide
-        return JitRenderer(scene, size, seed, Limits(depth - 1), lights_visible, guided)
+        return JitRenderer(scene, size, seed, Limits(depth - 1), lights_visible, guided, light_paths=True)
     # Cycles lets light in at the hit behind the last counted bounce, hence 12 + 1.
     bounces = min(depth - 1, 13)
     limits = Limits(bounces, 4, 4, 10.0, "blackman-harris", glossy_filter=True, multiscatter=True)
