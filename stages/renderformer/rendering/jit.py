@@ -13,6 +13,8 @@ lanes of a vector stay busy, and nothing is added by atomics. The host adds a pi
 
 from __future__ import annotations
 
+import functools
+import operator
 from dataclasses import dataclass
 
 import drjit as dr
@@ -20,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from stages.renderformer.records import SceneRecord
-from stages.renderformer.rendering.caustics import Film, LightPaths, narrow_triangles
+from stages.renderformer.rendering.caustics import PHOTONS, PORTION, Film, LightPaths, Photons, narrow_triangles
 from stages.renderformer.rendering.guiding import Guide, Trail, Unguided
 from stages.renderformer.rendering.lights import SLOTS, LightTable
 from stages.renderformer.rendering.material import Material
@@ -37,7 +39,7 @@ FILTER_CELLS = 1024
 BLACKMAN_HARRIS_SPAN = 3.0  # pixels from end to end: what Blender calls a width of 1.5
 # Dimensions of a bounce for the sampler; camera rays come before the first bounce.
 LIGHT_AND_LOBE, LIGHT_POINT, DIRECTION, ROULETTE, DIMENSIONS = range(5)
-GUIDE = 1 << 16  # behind those of all bounces: guided or not, the others stay as they are
+GUIDE, PHOTON = 1 << 16, 1 << 17  # behind those of all bounces: used or not, the others stay as they are
 FILM = 0xFFFFFFFF
 
 
@@ -137,6 +139,7 @@ class Lanes:
     start: Cameras | Points
     pixel: mi.UInt32
     view: mi.UInt32
+    stream: mi.UInt32  # index among those that are traced
     key: mi.UInt32  # of the random numbers
     first: mi.UInt32  # number of the first sample
     count: mi.UInt32  # samples
@@ -147,13 +150,13 @@ def _add(slots: list, slot: mi.Int32, value: mi.Color3f) -> list:
 
 
 @dr.syntax
-def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start, divided, guide):
+def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start, photons, guide):
     """Sums over the samples of each lane: (light slots, direct, albedo, normal, distance, hits, nearest distance, triangle).
 
     ``limits``: opaque (bounces, diffuse bounces, glossy bounces, indirect clamp on the sum over RGB). ``hide``: opaque
     bool, camera rays pass through lights. The triangle is that of the first sample, -1 where it hit nothing.
-    ``diffuse_start``: the first surface is a white diffuse one, whatever its material. ``divided``: light
-    paths bring what belongs to them (``caustics``). ``guide`` learns, and picks directions.
+    ``diffuse_start``: the first surface is a white diffuse one, whatever its material. ``photons``: light
+    that light paths have left; what belongs to those is left out (``caustics``). ``guide`` learns, and picks directions.
     """
     max_bounces, max_diffuse, max_glossy, clamp = limits
     slots = [mi.Color3f(0) for _ in range(SLOTS)]
@@ -167,8 +170,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
     fresh = mi.Bool(True)
     throughput, bsdf_pdf, widest = mi.Color3f(1), mi.Float(0), mi.Float(dr.inf)  # widest: least density so far
     bounce, diffuse, glossy = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-    # shares of the throughput that the first surface's wide part gave, and of it the last surface's narrow part
-    wide, theirs = mi.Color3f(0), mi.Color3f(0)
+    # shares of the throughput: narrow from the first surface on; narrow at the last surface, but not at all before
+    pure, theirs = mi.Color3f(1), mi.Color3f(0)
     trail = Trail.none()
 
     while done < lanes.count:
@@ -204,7 +207,7 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         light_pdf = dr.gather(mi.Float, lights.density, si.prim_index, hit) * si.t * si.t / dr.maximum(cosine, 1e-9)
         weight = dr.select(bounce == 0, 1, mis_weight(bsdf_pdf, light_pdf))
         value = throughput * dr.gather(mi.Color3f, lights.emission, si.prim_index, hit) * weight
-        if divided:
+        if photons is not None:
             value *= 1 - theirs
         value = dr.select(hit, clamped(value, dr.select(bounce > 1, clamp, dr.inf)), 0)
         slots = _add(slots, slot, value)
@@ -219,6 +222,13 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         if diffuse_start:
             white = bounce == 0
             lobes.diffuse, lobes.specular = dr.select(white, 1, lobes.diffuse), dr.select(white, 0, lobes.specular)
+        if photons is not None:  # those that were left about a first surface are joined to the cameras themselves
+            later = surface & (bounce > 0)
+            picked = sampler.one(dimension + PHOTON)
+            slot, value = photons.meet(lanes.stream, bounce, max_bounces, si, lobes, material, picked, later)
+            value = clamped(throughput * value, dr.select(later, clamp, dr.inf))
+            slots = _add(slots, slot, value)
+            guide.add(trail, value, later)
         spot = guide.at(lanes.view, si, lobes, surface)
         choice = sampler.two(dimension + LIGHT_AND_LOBE)
         lit, point = lights.sample(choice.x, sampler.two(dimension + LIGHT_POINT))
@@ -231,8 +241,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         sampled = surface & (cosine > 0) & (distance2 > 0) & (density > 0)
         dull, bright, pdf = material.evaluate_lobes(lobes, si.wi, si.to_local(to_light))
         reflected = dull + bright
-        if divided:
-            reflected = dull + bright * dr.select(lobes.is_narrow, 1 - wide, 1)
+        if photons is not None:
+            reflected = dull + bright * dr.select(lobes.is_narrow, pure, 1)
         sampled &= dr.max(reflected) > 0
         sampled &= ~scene.ray_test(shadow, sampled)
         light_pdf = density * distance2 / dr.maximum(cosine, 1e-9)
@@ -249,10 +259,10 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         wo = guide.direction(wo, spot, si, sampler.two(dimension + GUIDE), within)
         dull, bright, pdf = material.evaluate_lobes(lobes, si.wi, wo)
         scattered = dull + bright
-        if divided:
+        if photons is not None:
             narrow = dr.select(lobes.is_narrow & (scattered > 0), bright / scattered, 0)
-            theirs = dr.select(surface, wide * narrow, theirs)
-            wide = dr.select(surface & (bounce == 0), 1 - narrow, wide)
+            theirs = dr.select(surface, narrow * (1 - pure), theirs)
+            pure = dr.select(surface, narrow * pure, pure)
         direction, arriving = si.to_world(wo), mi.Color3f(throughput)
         pdf = guide.density(pdf, spot, direction)
         glossy += dr.select(surface & is_glossy, 1, 0)
@@ -272,8 +282,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         done += dr.select(fresh, 1, 0)
         throughput, bsdf_pdf = dr.select(fresh, 1, throughput), dr.select(fresh, 0, bsdf_pdf)
         widest = dr.select(fresh, dr.inf, widest)
-        if divided:
-            wide, theirs = dr.select(fresh, 0, wide), dr.select(fresh, 0, theirs)
+        if photons is not None:
+            pure, theirs = dr.select(fresh, 1, pure), dr.select(fresh, 0, theirs)
         trail = guide.step(trail, spot, direction, arriving, fresh)
         bounce, diffuse, glossy = [dr.select(fresh, 0, count) for count in (bounce, diffuse, glossy)]
 
@@ -316,9 +326,11 @@ class JitRenderer:
         self.guides = [Guide(scene) if guided else Unguided() for _ in self.passes]
         self.cameras = Cameras(scene, size, limits.filter)
         self.light_paths = None
-        if light_paths and limits.bounces > 1 and scene.n_lights and len(narrow_triangles(surfaces)[0]):
-            self.light_paths = LightPaths(scene, self.scene, surfaces, self.passes, seed)
-            hidden = scene.light_index >= 0 if not lights_visible else np.zeros(len(scene.light_index), bool)
+        narrow = narrow_triangles(surfaces)
+        if light_paths and limits.bounces > 1 and scene.n_lights and len(narrow[0]):
+            within = self.passes, seed, self.pixels, limits.bounces
+            self.light_paths = LightPaths(scene, self.scene, self.material, narrow, *within)
+            hidden = (scene.light_index >= 0) & (not lights_visible)
             seen = mesh_of(scene.triangles[~hidden], None)
             self.before_cameras = mi.load_dict({"type": "scene", "surface": seen})
 
@@ -333,7 +345,7 @@ class JitRenderer:
         Sums over ``spp`` samples: ``lights`` (N, L, 3); and ``triangle`` (N,), which ``height`` above the point is met first.
         """
         start, ids = Points(points, normals, height), np.arange(len(points))
-        passes = [self._pass(table, number, start, ids, [0], 0, spp) for number, table in enumerate(self.passes)]
+        passes = [self._pass(table, number, start, None, ids, [0], 0, spp) for number, table in enumerate(self.passes)]
         lights = np.concatenate([p["lights"][0] for p in passes], axis=-2)[:, : self.record.n_lights]
         return {"lights": lights, "triangle": passes[0]["triangle"][0]}
 
@@ -342,8 +354,21 @@ class JitRenderer:
 
         Streams share no path. A path serves all lights.
         """
+        if self.light_paths and spp > PORTION:
+            portions = [
+                self.sample(views, streams, begin, min(PORTION, first + spp - begin))
+                for begin in range(first, first + spp, PORTION)
+            ]
+            of_streams = [zip(*of_stream, strict=True) for of_stream in zip(*portions, strict=True)]
+            return [[functools.reduce(operator.add, of_view) for of_view in of_stream] for of_stream in of_streams]
         ids = np.concatenate([view * self.pixels + np.arange(self.pixels) for view in views])
-        passes = [self._pass(table, number, self.cameras, ids, streams, first, spp) for number, table in enumerate(self.passes)]
+        passes = []
+        for number, table in enumerate(self.passes):
+            photons = None
+            if self.light_paths:
+                paths = min(int(SHARE * self.pixels * spp), PHOTONS)
+                photons = self.light_paths.photons(number, streams, self.pixels * first, paths)
+            passes.append(self._pass(table, number, self.cameras, photons, ids, streams, first, spp))
         shape = (len(streams), len(views), *self.size)
         lights = np.concatenate([p["lights"] for p in passes], axis=-2)[..., : self.record.n_lights, :]
         hit = passes[0]  # the camera rays of all passes are the same
@@ -361,7 +386,7 @@ class JitRenderer:
         lights = []
         for number, table in enumerate(self.passes):
             film = Film(self.cameras, self.before_cameras, table.slots, views, np.asarray(windows))
-            self.light_paths.add(number, self.scene, self.material, film, stream, self.limits.bounces)
+            self.light_paths.trace(number, film, stream)
             lights.append(film.light().reshape(len(views), table.slots, *self.size, 3))
         for of_view, caustics, (first, last) in zip(sums, np.concatenate(lights, axis=1), windows, strict=True):
             of_view.caustics, of_view.paths = of_view.caustics + caustics, of_view.paths + last - first
@@ -371,6 +396,7 @@ class JitRenderer:
         table: LightTable,
         number: int,
         rays: Cameras | Points,
+        photons: Photons | None,
         ids: np.ndarray,
         streams: list[int],
         first: int,
@@ -389,8 +415,14 @@ class JitRenderer:
                 row = np.arange(start, min(start + step, rows)).repeat(depth)
                 number_of = block + np.tile(np.arange(depth), len(row) // depth)
                 counts = np.minimum(size, spp - number_of * size)
-                where = ids[row % len(ids)], np.asarray(streams)[row // len(ids)], first + number_of * size, counts
-                for name, value in self._chunk(table, number, rays, *where).items():
+                where = (
+                    ids[row % len(ids)],
+                    np.asarray(streams)[row // len(ids)],
+                    row // len(ids),
+                    first + number_of * size,
+                    counts,
+                )
+                for name, value in self._chunk(table, number, rays, photons, *where).items():
                     parts = value.reshape(*value.shape[:-1], -1, depth)
                     part = slice(start, start + parts.shape[-2])
                     if name == "triangle":
@@ -410,8 +442,10 @@ class JitRenderer:
         table: LightTable,
         number: int,
         rays: Cameras | Points,
+        photons: Photons | None,
         pixel: np.ndarray,
         stream: np.ndarray,
+        row: np.ndarray,
         first: np.ndarray,
         count: np.ndarray,
     ) -> dict[str, np.ndarray]:
@@ -420,11 +454,11 @@ class JitRenderer:
         def opaque(value: int) -> mi.UInt32:
             return dr.opaque(mi.UInt32, value & 0xFFFFFFFF)
 
-        places = (pixel, stream, pixel // self.pixels, first, count)
-        ids, streams, views, first, count = (gatherable(values, mi.UInt32) for values in places)
+        places = (pixel, stream, row, pixel // self.pixels, first, count)
+        ids, streams, row, views, first, count = (gatherable(values, mi.UInt32) for values in places)
         # the first two steps are one to one in the pixel: no two pixels of a stream share their numbers
         key = mixed(mixed(mixed(ids + opaque(self.seed)) + opaque(self.seed >> 32)) + streams)
-        lanes = Lanes(rays, ids, views, key, first, count)
+        lanes = Lanes(rays, ids, views, row, key, first, count)
         limits = self.limits
         bounds = (
             opaque(limits.bounces),
@@ -435,10 +469,9 @@ class JitRenderer:
         hide = dr.opaque(mi.Bool, not self.lights_visible)
         pass_key = opaque(number * 0x5851F42D)
         white = isinstance(rays, Points)
-        divided = self.light_paths is not None and not white
         guide = Unguided() if white else self.guides[number]
         out = trace_paths(
-            self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, divided, guide
+            self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, photons, guide
         )
         dr.eval(out)
         slots, *wide, distances, hits, nearest, triangle = out
