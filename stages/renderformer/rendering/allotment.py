@@ -6,9 +6,9 @@ import numpy as np
 
 from stages.renderformer.rendering.sums import Sums
 
-FIRST = 1.0  # light paths per camera path before anything is known
-RANGE = (0.25, 8.0)
-COST = 1.5  # of a light path over that of a camera path
+FIRST = 0.25  # light paths per camera path before anything is known
+RANGE = (0.06, 4.0)
+COST = 1.0  # of a light path over that of a camera path
 CELL = 4  # pixels over which the denoiser is taken to smooth, per axis
 
 

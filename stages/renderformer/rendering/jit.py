@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from stages.renderformer.records import SceneRecord
-from stages.renderformer.rendering.caustics import PHOTONS, PORTION, Film, LightPaths, Photons, narrow_triangles
+from stages.renderformer.rendering.caustics import PHOTONS, PORTION, SHARE, Film, LightPaths, Photons, narrow_triangles
 from stages.renderformer.rendering.guiding import Guide, Trail, Unguided
 from stages.renderformer.rendering.lights import SLOTS, LightTable
 from stages.renderformer.rendering.material import Material
