@@ -228,7 +228,6 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
             slot, value = photons.meet(lanes.stream, bounce, max_bounces, si, lobes, material, picked, later)
             value = clamped(throughput * value, dr.select(later, clamp, dr.inf))
             slots = _add(slots, slot, value)
-            guide.add(trail, value, later)
         spot = guide.at(lanes.view, si, lobes, surface)
         choice = sampler.two(dimension + LIGHT_AND_LOBE)
         lit, point = lights.sample(choice.x, sampler.two(dimension + LIGHT_POINT))
@@ -322,8 +321,6 @@ class JitRenderer:
         self.scene = mi.load_dict({"type": "scene", "surface": shape_mesh(scene, surfaces)})
         self.material = Material(surfaces, limits.multiscatter)
         self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
-        self.guided = guided
-        self.guides = [Guide(scene) if guided else Unguided() for _ in self.passes]
         self.cameras = Cameras(scene, size, limits.filter)
         self.light_paths = None
         narrow = narrow_triangles(surfaces)
@@ -333,6 +330,8 @@ class JitRenderer:
             hidden = (scene.light_index >= 0) & (not lights_visible)
             seen = mesh_of(scene.triangles[~hidden], None)
             self.before_cameras = mi.load_dict({"type": "scene", "surface": seen})
+        self.guided = guided and not self.light_paths  # what guiding finds best is what light paths bring
+        self.guides = [Guide(scene) if self.guided else Unguided() for _ in self.passes]
 
     def learn(self, views: list[int]) -> None:
         """Guide the paths of these views from now on by what those so far have brought."""

@@ -80,15 +80,17 @@ def render_views(
             quality, error = "high" if denoise else None, None
             if len(halves) > 1:
                 allotments[view].weigh(*of_streams)
-                quality, error = judges[view].error(*halves, all_samples)
-            if sampled_spp == total or error is None or error <= target_error:
-                records[view] = _finish(all_samples, sums, view, quality, error, len(streams) * sampled_spp - sums.spp)
+                quality, error = judges[view].error(sums.spp, *halves, all_samples)
+            done = sampled_spp == total or error is None or error <= target_error
+            stalled = not done and judges[view].stalled(sums.spp, max_spp)
+            if done or stalled:
+                records[view] = _finish(all_samples, sums, view, quality, error)
+                records[view].meta |= {"dropped": len(streams) * sampled_spp - sums.spp, "stalled": stalled}
                 del parts[view]
                 continue
             unfinished.append(view)
             if renderer.guided and sampled_spp == step and total >= 2 * sampled_spp and error > FAR * target_error:
-                # guided samples are so much better that these would only harm
-                parts[view] = [part.without_camera_paths() for part in of_streams]
+                parts[view] = []  # guided samples are so much better that these would only harm
             else:  # no error falls faster than by the square root, and denoised ones do not reach it
                 due[view] = sampled_spp + ((error / target_error) ** (2.5 if denoise else 2.0) - 1) * of_streams[0].spp
         active, step = unfinished, min(_next(sampled_spp) - sampled_spp, total - sampled_spp)
@@ -123,7 +125,7 @@ def _renderer(scene: SceneRecord, settings: RenderSettings, backend: dict[str, A
     return JitRenderer(scene, size, seed, limits, lights_visible)
 
 
-def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error: float | None, dropped: int) -> ViewRecord:
+def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error: float | None) -> ViewRecord:
     """The stored view: every light denoised on its own (quality None: not at all), and what is to be said of it."""
     nearest = float(sums.nearest.min())
     if quality:
@@ -139,7 +141,6 @@ def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error
         "status": "too_close" if nearest < MIN_DEPTH else "dark" if mean < MIN_MEAN else "ok",
         "mean": mean,
         "spp": sums.spp,
-        "dropped": dropped,
         "error": error,
         "denoiser": quality,
         "clamped": clamped_values(view),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -36,11 +36,6 @@ class Sums:
         summed = [f.name for f in fields(self) if f.name not in ("nearest", "triangle")]
         total = {name: getattr(self, name) + getattr(other, name) for name in summed}
         return Sums(**total, nearest=np.minimum(self.nearest, other.nearest), triangle=self.triangle)
-
-    def without_camera_paths(self) -> Sums:
-        """What light paths have brought."""
-        summed = [f.name for f in fields(self) if f.name not in ("spp", "nearest", "triangle", "caustics", "paths")]
-        return replace(self, spp=0, **{name: np.zeros_like(getattr(self, name)) for name in summed})
 
     def view(self, object_index: np.ndarray) -> ViewRecord:
         """The means, without meta; ``object_index`` (F,) is the scene's."""

@@ -1,0 +1,150 @@
+"""Light paths: the same light as camera paths bring, with less noise, in the same bytes on every run."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages.graphics.mitsuba import backend as backends
+from stages.renderformer.rendering.error import Judge
+from stages.renderformer.views import encode_view
+from tests.renderformer.fakes import path_traced, with_textures
+from tests.renderformer.test_rendering import build, camera, caustic, jit, quad  # noqa: F401 (a fixture)
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def views():
+    """The module of the bench's six views."""
+    spec = importlib.util.spec_from_file_location("bench_caustics", ROOT / "bench" / "caustics.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def renderer(scene, size=16, light_paths=True, **limits):
+    from stages.renderformer.rendering.jit import JitRenderer, Limits
+
+    return JitRenderer(scene, (size, size), 4, Limits(**{"bounces": 8, **limits}), False, light_paths=light_paths)
+
+
+def image(renderer, spp, stream=0, first=0):
+    """(L, H, W, 3) light of all paths."""
+    ((sums,),) = renderer.sample([0], [stream], first, spp)
+    if renderer.light_paths:
+        renderer.add_caustics([sums], [0], stream, [(first * renderer.pixels, (first + spp) * renderer.pixels)])
+    return sums.lights / sums.spp + sums.caustics / max(sums.paths, 1)
+
+
+def mirrors():
+    """A wall lit by a lamp's reflection in a rough mirror, both seen in a second mirror that is no less rough: all kinds of
+    paths, and lobes wide enough for chance to find them. Normals lean, as those of smooth shapes do."""
+    surfaces = [
+        (quad((0, 0, -0.5), (0.6, 0, 0), (0, 0.6, 0)), (0.7, 0.5, 0.3), 0.2, 0.5),
+        (quad((0, 0.6, 0.1), (0.6, 0, 0), (0, 0, 0.6)), 0.1, 0.8, 0.3),
+        (quad((-0.6, 0, 0.1), (0, 0.6, 0), (0, 0, 0.6)), (0.0, 0.1, 0.2), 0.7, 0.28),
+    ]
+    lamps = [np.array([[[x, -0.6, 1.4], [x + 0.3, -0.6, 1.4], [x, -0.3, 1.4]]]) for x in (-0.2, 0.3)]
+    scene = build(surfaces, [(lamps[0], (60, 50, 40)), (lamps[1], 30)], [camera((0.7, -2, 0.8), (0, 0, -0.2))])
+    lean = scene.vertex_normals + np.float32([0.1, -0.15, 0.1])
+    scene.vertex_normals = lean / np.linalg.norm(lean, axis=2, keepdims=True)
+    return scene
+
+
+@pytest.mark.parametrize(("name", "bounces"), [("plain", 8), ("plain", 2), ("plain", 3), ("textured", 8)])
+def test_light_paths_bring_the_light_that_camera_paths_leave_out(jit, name, bounces):  # noqa: F811
+    """Means by light and channel, and pixel by pixel, against camera paths alone."""
+    backends.activate(jit)
+    scene = with_textures(mirrors(), 2) if name == "textured" else mirrors()
+    one, other = (renderer(scene, light_paths=flag, bounces=bounces) for flag in (False, True))
+    assert other.light_paths and not one.light_paths
+    ((alone,),) = other.sample([0], [0], 0, 256)  # without what is joined
+    truth, joined = image(one, 4096), image(other, 1024)
+    assert (alone.lights / 256).mean() < 0.97 * truth.mean()
+    np.testing.assert_allclose(joined.mean(axis=(1, 2)), truth.mean(axis=(1, 2)), rtol=0.01)
+    assert np.abs(np.minimum(joined, 4).mean() / np.minimum(truth, 4).mean() - 1) < 0.005
+    assert np.abs(joined - truth).mean() < 0.02 * truth.mean()
+
+
+def test_light_paths_have_less_noise(jit, views):  # noqa: F811
+    backends.activate(jit)
+    scene = views.scene("cylinder")
+    noise = {}
+    for flag in (False, True):
+        one = renderer(scene, size=32, light_paths=flag, bounces=33)
+        a, b = (np.log10(1 + image(one, 16, stream).sum(axis=0)) for stream in (0, 1))
+        noise[flag] = np.sqrt(((a - b) ** 2).mean())
+    assert noise[True] < 0.4 * noise[False]
+
+
+def hashed(views):
+    return [hashlib.sha256(b"".join(encode_view(view).values())).hexdigest() for view in views]
+
+
+def test_bytes_depend_neither_on_threads_nor_on_chunks_or_views(jit, monkeypatch):  # noqa: F811
+    from stages.renderformer.rendering import caustics as module
+
+    scene = mirrors()
+    scene.camera_to_world = np.repeat(scene.camera_to_world, 2, axis=0)
+    scene.camera_to_world[1, :3, 3] += (0.2, 0, 0.1)
+    scene.fov_deg = np.repeat(scene.fov_deg, 2)
+    kept = {"max_spp": 48, "target_error": 1e-9, "seed": 2, "backend": jit, "denoise": False}
+    whole = hashed(path_traced(scene, 16, threads=1, **kept))
+    assert hashed(path_traced(scene, 16, threads=2, **kept)) == whole
+    assert hashed(path_traced(scene, 16, views=[1], **kept)) == whole[1:]
+    monkeypatch.setattr(module, "CHUNK", 700)
+    monkeypatch.setattr(module, "LANE", 5)
+    assert hashed(path_traced(scene, 16, **kept)) == whole
+    assert hashed(path_traced(scene, 16, **{**kept, "seed": 3})) != whole
+
+
+def test_light_paths_serve_where_they_can(jit):  # noqa: F811
+    """Not for rough surfaces, without lamps, by direct light alone or where indirect light is clamped."""
+    from stages.renderformer.rendering.render import _renderer
+    from stages.renderformer.rendering.settings import RenderSettings
+
+    backends.activate(jit)
+    assert renderer(mirrors()).light_paths
+    assert not renderer(caustic()).light_paths
+    assert not renderer(mirrors(), bounces=1).light_paths
+    dark = mirrors()
+    dark.light_index[:], dark.emission[:] = -1, 0
+    assert not renderer(dark).light_paths
+    for mode in ("physical", "cycles"):
+        assert bool(_renderer(mirrors(), RenderSettings(8, 16, mode=mode), jit).light_paths) == (mode == "physical")
+
+
+def test_hidden_lamps_hide_no_caustics(jit):  # noqa: F811
+    """A lamp between camera and floor: cameras see through it, or see it."""
+    scene = mirrors()
+    lamp = np.float32([[[0.2, -1.2, -0.2], [0.7, -1.2, 0.2], [0.2, -1.1, 0.8]]])
+    for name, value in {"triangles": lamp, "emission": [[1e-3] * 3], "light_index": [2]}.items():
+        before = getattr(scene, name)
+        setattr(scene, name, np.concatenate([before, np.asarray(value, before.dtype)]))
+    for name in ("vertex_normals", "diffuse", "specular", "roughness", "object_index"):
+        setattr(scene, name, np.concatenate([getattr(scene, name), getattr(scene, name)[-1:]]))
+    kept = {"max_spp": 256, "seed": 0, "backend": jit, "denoise": False}
+    hidden, seen = (path_traced(scene, 16, lights_visible=flag, **kept)[0] for flag in (False, True))
+    behind = seen.lights[2] > 5e-4  # on the lamp
+    assert behind.any() and (hidden.lights[0][behind] > 0).mean() > 0.5
+    assert np.abs(seen.lights[:2][:, (seen.lights[2] == 1e-3).all(axis=-1)]).max(initial=0) < 1e-6
+
+
+def test_estimates_that_fall_too_slowly_stop_a_view():
+    def judged(errors, most=4096):
+        judge = Judge(0.002, True)
+        stalls = []
+        for number, error in enumerate(errors):
+            judge.told.append((32 << number, error))
+            stalls.append(judge.stalled(32 << number, most))
+        return stalls
+
+    assert judged([0.02, 0.019, 0.018, 0.017]) == [False, False, True, True]
+    assert not any(judged([0.02, 0.014, 0.01, 0.007, 0.005]))  # as samples pay for
+    assert not any(judged([0.0022, 0.0021, 0.00205]))  # slowly, but it gets there
+    assert not any(Judge(0.002, True).stalled(samples, 64) for samples in (16, 64))  # nothing told
