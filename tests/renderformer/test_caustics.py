@@ -41,34 +41,41 @@ def image(renderer, spp, stream=0, first=0):
     return sums.lights / sums.spp + sums.caustics / max(sums.paths, 1)
 
 
-def mirrors():
-    """A wall lit by a lamp's reflection in a rough mirror, both seen in a second mirror that is no less rough: all kinds of
-    paths, and lobes wide enough for chance to find them. Normals lean, as those of smooth shapes do."""
+def mirrors(roughness=0.28, lamp=0.3):
+    """A floor and two metal walls: light of all kinds of paths. Normals lean, as those of smooth shapes do.
+
+    ``lamp``: length of the lamps' legs.
+    """
     surfaces = [
-        (quad((0, 0, -0.5), (0.6, 0, 0), (0, 0.6, 0)), (0.7, 0.5, 0.3), 0.2, 0.5),
-        (quad((0, 0.6, 0.1), (0.6, 0, 0), (0, 0, 0.6)), 0.1, 0.8, 0.3),
-        (quad((-0.6, 0, 0.1), (0, 0.6, 0), (0, 0, 0.6)), (0.0, 0.1, 0.2), 0.7, 0.28),
+        (quad((0, 0, -0.5), (0.6, 0, 0), (0, 0.6, 0)), (0.7, 0.5, 0.3), 0.2, 0.7),
+        (quad((0, 0.6, 0.1), (0.6, 0, 0), (0, 0, 0.6)), 0.1, 0.8, roughness),
+        (quad((-0.6, 0, 0.1), (0, 0.6, 0), (0, 0, 0.6)), (0.0, 0.1, 0.2), 0.7, roughness),
     ]
-    lamps = [np.array([[[x, -0.6, 1.4], [x + 0.3, -0.6, 1.4], [x, -0.3, 1.4]]]) for x in (-0.2, 0.3)]
+    lamps = [np.array([[[x, -0.6, 1.4], [x + lamp, -0.6, 1.4], [x, lamp - 0.6, 1.4]]]) for x in (-0.2, 0.3)]
     scene = build(surfaces, [(lamps[0], (60, 50, 40)), (lamps[1], 30)], [camera((0.7, -2, 0.8), (0, 0, -0.2))])
     lean = scene.vertex_normals + np.float32([0.1, -0.15, 0.1])
     scene.vertex_normals = lean / np.linalg.norm(lean, axis=2, keepdims=True)
     return scene
 
 
-@pytest.mark.parametrize(("name", "bounces"), [("plain", 8), ("plain", 2), ("plain", 3), ("textured", 8)])
-def test_light_paths_bring_the_light_that_camera_paths_leave_out(jit, name, bounces):  # noqa: F811
-    """Means by light and channel, and pixel by pixel, against camera paths alone."""
+@pytest.mark.parametrize(("name", "bounces"), [("plain", 8), ("plain", 2), ("textured", 3)])
+def test_light_paths_bring_the_light_that_camera_paths_leave_out(jit, monkeypatch, name, bounces):  # noqa: F811
+    """Means by light and channel, and pixel by pixel, against camera paths alone; all that is narrow is so wide here, and
+    lamps so large, that chance finds them too."""
+    from stages.renderformer.rendering import caustics, material
+
     backends.activate(jit)
-    scene = with_textures(mirrors(), 2) if name == "textured" else mirrors()
+    for module in (caustics, material):
+        monkeypatch.setattr(module, "NARROW_ALPHA", 0.3)
+    scene = mirrors(0.52, 0.9)
+    scene = with_textures(scene, 3) if name == "textured" else scene
     one, other = (renderer(scene, light_paths=flag, bounces=bounces) for flag in (False, True))
     assert other.light_paths and not one.light_paths
-    ((alone,),) = other.sample([0], [0], 0, 256)  # without what is joined
-    truth, joined = image(one, 4096), image(other, 1024)
-    assert (alone.lights / 256).mean() < 0.97 * truth.mean()
-    np.testing.assert_allclose(joined.mean(axis=(1, 2)), truth.mean(axis=(1, 2)), rtol=0.01)
-    assert np.abs(np.minimum(joined, 4).mean() / np.minimum(truth, 4).mean() - 1) < 0.005
-    assert np.abs(joined - truth).mean() < 0.02 * truth.mean()
+    ((alone,),) = other.sample([0], [0], 0, 64)  # without what is joined
+    truth, joined = image(one, 2048), image(other, 1024)
+    assert (alone.lights / 64).mean() < 0.9 * truth.mean()
+    np.testing.assert_allclose(joined.mean(axis=(1, 2)), truth.mean(axis=(1, 2)), rtol=5e-3)
+    assert np.abs(joined - truth).mean() < 0.015 * truth.mean()
 
 
 def test_light_paths_have_less_noise(jit, views):  # noqa: F811

@@ -49,7 +49,7 @@ LEAST_COSINE = 0.1
 ESCAPES, UNSEEN = 0.1, 0.02  # what a probe counts that leaves the scene behind the triangle, or does not get to it
 # Dimensions of a vertex for the sampler; those of the start come before.
 PAIR, LIGHT_POINT, POINT, START = range(4)
-DIRECTION, ROULETTE, DIMENSIONS = range(3)
+END, DIRECTION, ROULETTE, DIMENSIONS = range(4)
 
 
 class Starts:
@@ -140,6 +140,8 @@ class Film:
     ``windows``: (V, 2) the first and the last but one path number that count for each of the ``views``.
     """
 
+    ends = False  # paths go on behind a point that is joined
+
     def __init__(self, cameras, scene: mi.Scene, slots: int, views: Sequence[int], windows: np.ndarray):
         self.first, self.last = int(windows.min()), int(windows.max())
         self.cameras, self.scene = cameras, scene  # the scene that stands between surfaces and cameras
@@ -205,6 +207,8 @@ class Texels:
 
 class Photons:
     """The photons of some paths of each of several streams, by texels."""
+
+    ends = True  # a path where it leaves its photon
 
     def __init__(self, texels: Texels, paths: int):
         self.texels, self.paths = texels, paths
@@ -295,18 +299,26 @@ def trace_light(scene, lights, starts, material, sink, key, first, count, max_bo
         # Light per area across its way. A path's first point was chosen by area: there it is per area of the surface.
         carried /= dr.select(vertex == 0, 1, dr.maximum(dr.abs(dr.dot(si.n, ray.d)), 1e-6))
         wide, narrow = (lobes.part(flag) for flag in (False, True))
-        meets = alive & (vertex > 0) & (dr.max(wide.diffuse + wide.specular) > 0)
-        sink.take(number, vertex, slot, carried, si, wide, material, meets)
+        dimension = START + vertex * DIMENSIONS
+        by_wide, by_narrow = dr.max(wide.diffuse + wide.specular), dr.max(narrow.specular)
+        meets = alive & (vertex > 0) & (by_wide > 0)
+        if sink.ends:  # a path leaves one photon: it ends there, by chance
+            chance = dr.select(vertex == 0, 0, by_wide / dr.maximum(by_wide + by_narrow, 1e-30))
+            ends = sampler.one(dimension + END) < chance
+            sink.take(number, vertex, slot, carried / chance, si, wide, material, meets & ends)
+            carried /= dr.maximum(1 - chance, 1e-6)
+            alive &= ~ends
+        else:
+            sink.take(number, vertex, slot, carried, si, wide, material, meets)
 
         # Go on by the narrow part, from here to where the camera path would have come from.
-        dimension = START + vertex * DIMENSIONS
         wo, _ = material.sample(narrow, si.wi, mi.Float(0), sampler.two(dimension + DIRECTION))
         scattered, pdf = material.evaluate(narrow, si.wi, wo)
         direction = si.to_world(wo)
         # by the cosines of the camera path: what it scatters is the light by that to the shading normal
         turned = dr.abs(si.wi.z) * dr.abs(dr.dot(si.n, direction)) / dr.maximum(dr.abs(wo.z), 1e-6)
         carried *= dr.select(pdf > 0, scattered / pdf, 0) * turned
-        survival = dr.select(vertex < RR_DEPTH, 1, dr.clip(dr.max(narrow.specular), 0.05, 0.95))
+        survival = dr.select(vertex < RR_DEPTH, 1, dr.clip(by_narrow, 0.05, 0.95))
         alive &= (dr.max(carried) > 0) & (vertex + 2 <= max_bounces) & (sampler.one(dimension + ROULETTE) < survival)
         carried /= survival
         ray = si.spawn_ray(direction)
