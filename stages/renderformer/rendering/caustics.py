@@ -151,8 +151,8 @@ class Film:
         self.count, self.slots, self.pixels = (dr.opaque(mi.UInt32, size) for size in self.shape[:3])
 
     def light(self) -> np.ndarray:
-        """(views, slots, pixels, 3) sums of light over the paths."""
-        return self.sums.numpy().reshape(self.shape) * UNIT
+        """(views, slots, pixels, 3) float32 sums of light over the paths."""
+        return (self.sums.numpy().reshape(self.shape) * UNIT).astype(np.float32)
 
     @dr.syntax
     def take(self, number, vertices, slot, arriving, si, wide, material, active):
