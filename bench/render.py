@@ -31,8 +31,8 @@ kinder to it: the renderers agree to a few tenths of a per cent (a table says ho
 smallest targets, and its own truth has more noise where ours was made with path guiding. The column "mean" (of values
 clamped at 4, over the raw truth's) shows how far an image is on the whole.
 
-``--costs N`` does something else: it renders all views of N of the scenes to ``--target``, with light paths and without, and prints
-the CPU seconds a scene takes by roughness and template; with ``--caustics`` those of the six views of ``bench/caustics.py``.
+``--costs N`` does something else: it renders all views of N of the scenes to ``--target``, with light paths and without, and
+prints the CPU seconds a scene takes by roughness and template; with ``--caustics`` of the six views of ``bench/caustics.py``.
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ class Sums:
     lights (L, H, W, 3), direct, albedo, normal (H, W, 3); distance (H, W) over the samples that hit something, hits (H, W)
     their number. Not sums: nearest (H, W), the smallest distance, infinite where nothing was hit; triangle (H, W) int32, what
     the first sample hit, -1 for nothing.
-    caustics (L, H, W, 3) float32: light over ``paths`` light paths (``stages.renderformer.rendering.caustics``), which camera paths
-    leave out; 0 where there are none.
+    caustics (L, H, W, 3) float32: sums over ``paths`` light paths (``stages.renderformer.rendering.caustics``) of the light
+    that camera paths leave out; 0 where there are none.
     """
 
     spp: int
