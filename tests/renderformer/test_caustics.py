@@ -142,6 +142,28 @@ def test_hidden_lamps_hide_no_caustics(jit):  # noqa: F811
     assert np.abs(seen.lights[:2][:, (seen.lights[2] == 1e-3).all(axis=-1)]).max(initial=0) < 1e-6
 
 
+def test_light_paths_are_allotted_by_their_noise():
+    from stages.renderformer.rendering.allotment import RANGE, Allotment
+    from stages.renderformer.rendering.sums import Sums
+
+    rng = np.random.default_rng(0)
+
+    def half(light):
+        lights, caustics = (1 + noise * rng.normal(size=(2, 16, 16, 3)) for noise in (0.1, light))
+        return Sums(8, 8 * lights, *[np.zeros(1)] * 7, caustics=512 * caustics, paths=512)
+
+    ratios = []
+    for noise in (0.0, 0.1, 0.2, 9.0):
+        allotment = Allotment((16, 16))
+        assert allotment.window(8) == (0, 512)  # a quarter of the camera paths
+        allotment.weigh(half(noise), half(noise))
+        ratios.append(allotment.ratio)
+        first, last = allotment.window(16)
+        assert first == 512 and last == max(512, round(allotment.ratio * 256 * 16))
+    assert ratios[0] == RANGE[0] and ratios[1] == pytest.approx(0.5, rel=0.2)
+    assert ratios[2] == pytest.approx(2 * ratios[1], rel=0.2) and ratios[3] == RANGE[1]
+
+
 def test_estimates_that_fall_too_slowly_stop_a_view():
     def judged(errors, most=4096):
         judge = Judge(0.002, True)
