@@ -30,6 +30,9 @@ Cycles is judged by a truth of its own, made the same way with as many samples a
 kinder to it: the renderers agree to a few tenths of a per cent (a table says how well), but that is not far below the
 smallest targets, and its own truth has more noise where ours was made with path guiding. The column "mean" (of values
 clamped at 4, over the raw truth's) shows how far an image is on the whole.
+
+``--costs N`` does something else: it renders all views of N of the scenes to ``--target``, with light paths and without, and
+prints the CPU seconds a scene takes by roughness and template; with ``--caustics`` of the six views of ``bench/caustics.py``.
 """
 
 from __future__ import annotations
@@ -62,7 +65,7 @@ from stages.graphics.metrics import log_error
 from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.records import SceneRecord
 from stages.renderformer.rendering.render import render_views
-from stages.renderformer.rendering.settings import RenderSettings
+from stages.renderformer.rendering.settings import MODES, RenderSettings
 from stages.renderformer.s04_render import Render
 from stages.renderformer.scenes.released import load_scene
 from stages.renderformer.views import encode_view, view_members
@@ -650,6 +653,52 @@ def print_productions(views: list[View], productions: dict[str, Production]) -> 
     table([*titles, "s per view: median (range)", "over ours: median (range)", "error: median (range)"], rows)
 
 
+def print_costs(arguments: argparse.Namespace, backend: dict[str, Any], scenes: list[SceneRecord]) -> None:
+    """CPU seconds to render all views of each scene to the target error, with and without light paths, side by side."""
+    from stages.renderformer.rendering import caustics
+
+    alphas = {"before": 0.0, "after": caustics.NARROW_ALPHA}  # of the narrow parts: nothing, or what light paths serve
+    rows: list[tuple[list[str], dict[str, tuple[float, list[dict]]]]] = []
+    for scene in scenes:
+        spent = {}
+        for name, alpha in alphas.items():
+            caustics.NARROW_ALPHA = alpha
+            if not rows:
+                warm_up(scene, backend, arguments.threads)
+            settings = RenderSettings(
+                arguments.resolution,
+                arguments.max_spp,
+                seed_for(arguments.seed, "bench/costs", scene.id),
+                arguments.target,
+                max_depth=MAX_DEPTH,
+                mode=arguments.mode,
+            )
+            began = time.process_time()
+            views = render_views(scene, settings, backend, threads=arguments.threads)
+            spent[name] = time.process_time() - began, [view.meta for view in views]
+        # the roughness of what is most like a mirror, of all that reflects as much by GGX as the mean surface does
+        bright = (scene.specular.max(axis=1) >= 0.3) & (scene.light_index < 0)
+        least = float(scene.roughness[bright].min(initial=1))
+        kind = "under 0.15" if least < 0.15 else "0.15 to 0.32" if least < 0.32 else "over 0.32"
+        rows.append((["all", f"roughness {kind}", scene.meta.get("template", "-"), *([scene.id] * arguments.caustics)], spent))
+        told = ", ".join(f"{name} {seconds:.1f} s" for name, (seconds, _) in spent.items())
+        progress(f"{scene.id} ({', '.join(rows[-1][0][1:3])}): {told}")
+    titles = ["scenes", "number", *(f"{name}: {what}" for name in alphas for what in ("mean s", "p50", "p90", "over target"))]
+    printed = []
+    for group in sorted({group for groups, _ in rows for group in groups}):
+        of_group = [spent for groups, spent in rows if group in groups]
+        row = [group, str(len(of_group))]
+        for name in alphas:
+            seconds = [spent[name][0] for spent in of_group]
+            over = [meta["error"] > arguments.target for spent in of_group for meta in spent[name][1]]
+            row += [
+                *(f"{value:.2f}" for value in (np.mean(seconds), *np.percentile(seconds, (50, 90)))),
+                f"{np.mean(over):.0%}",
+            ]
+        printed.append(row)
+    table([*titles, "after over before"], [[*row, f"{float(row[6]) / max(float(row[2]), 0.01):.2f}"] for row in printed])
+
+
 def print_machine(arguments: argparse.Namespace, backend: dict[str, Any]) -> None:
     info = Path("/proc/cpuinfo")
     models = [line for line in info.read_text().splitlines() if line.startswith("model name")] if info.exists() else []
@@ -712,6 +761,9 @@ def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--cycles-patience", type=number, default=90.0, metavar="S", help="with tuned Cycles, default %(default)s"
     )
+    parser.add_argument("--costs", type=whole, metavar="N", help="only CPU seconds, of so many scenes")
+    parser.add_argument("--caustics", action="store_true", help="with --costs: of the six views of bench/caustics.py")
+    parser.add_argument("--mode", choices=MODES, default="physical", help="with --costs; default %(default)s")
     parser.add_argument("--backend", choices=backends.CHOICES, default="auto")
     parser.add_argument("--threads", type=whole, default=os.cpu_count(), help="for each renderer, default all (%(default)s)")
     parser.add_argument("--seed", type=int, default=0)
@@ -732,6 +784,15 @@ def main() -> None:
     arguments.work.mkdir(parents=True, exist_ok=True)
     backend = backends.choose(arguments.backend)
     print_machine(arguments, backend)
+    if arguments.costs:
+        if arguments.caustics:
+            import caustics
+
+            scenes = list(caustics.scenes().values())
+        else:
+            scenes = read_scenes(arguments.scenes) if arguments.scenes else made_scenes(arguments.work)
+        stride = max(1, len(scenes) // arguments.costs)
+        return print_costs(arguments, backend, scenes[::stride][: arguments.costs])
     bench = Bench(arguments, backend)
     cycles = Cycles(arguments, backend["backend"] == "cuda") if arguments.cycles_python else None
     if cycles:

@@ -58,7 +58,7 @@ class RenderWorker:
 
 class Render(MapStage):
     name = "render"
-    version = 5
+    version = 6
     inputs = ("scene",)
     Config = RenderConfig
     reasons = {
@@ -133,7 +133,7 @@ class Render(MapStage):
         from stages.renderformer.rendering.sheet import write_sheets
 
         statuses: Counter[str] = Counter()
-        clamped = over = 0
+        clamped = over = stalled = 0
         samples, errors = array("q"), array("d")  # of the kept views: compact, there may be millions
         pairs: list[dict[str, Any]] = []
         scenes: dict[tuple[str, str], list[str]] = {}
@@ -145,6 +145,7 @@ class Render(MapStage):
                 clamped += view["clamped"]
                 if view["status"] == "ok":
                     samples.append(view["spp"])
+                    stalled += view["stalled"]
                     if view["error"] is not None:
                         errors.append(view["error"])
                         over += view["error"] > config.target_error > 0
@@ -155,7 +156,8 @@ class Render(MapStage):
         if errors:
             draft.note("estimated_error", spread(errors))
         if samples and config.target_error:
-            draft.note("share_over_target_at_max_spp", round(over / len(samples), 5))
+            draft.note("share_over_target_at_max_spp", round((over - stalled) / len(samples), 5))
+            draft.note("stalled_views", stalled)  # ended above the target: more samples would not have paid
         if pairs:
             draft.note("noise_floor", noise_floor(pairs))
         else:

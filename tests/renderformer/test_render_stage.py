@@ -156,12 +156,12 @@ def test_summary_tells_samples_errors_and_the_noise_floor(tmp_path, capsys):
     """What ``lightmill show render`` prints, of views whose numbers are given."""
 
     def view(index, **facts):
-        return {"index": index, "status": "ok", "spp": 16, "error": 0.001, "clamped": 0, **facts}
+        return {"index": index, "status": "ok", "spp": 16, "error": 0.001, "clamped": 0, "stalled": False, **facts}
 
     pair = {"sum": {"log_error": 0.002, "psnr": 40.0}, "reweighted": [{"log_error": e, "psnr": 30.0} for e in (0.001, 0.005)]}
     metas = {
         "a": [view(0), view(1, spp=64, error=0.003, noise=pair), view(2, spp=64, error=0.002)],
-        "b": [view(0, spp=32), view(1, spp=64, error=0.9, clamped=7), view(2, status="dark", spp=64, error=0.0)],
+        "b": [view(0, spp=32), view(1, spp=48, error=0.9, clamped=7, stalled=True), view(2, status="dark", spp=64, error=0.0)],
     }
     picture = np.ones((8, 8, 3), np.float32)
     meta = {"index": 0, "spp": 16, "error": None}
@@ -184,9 +184,10 @@ def test_summary_tells_samples_errors_and_the_noise_floor(tmp_path, capsys):
         commands._summary(name, value)
     assert [line.removeprefix("  summary   ") for line in capsys.readouterr().out.splitlines()] == [
         "views: clamped_values 7, dark 1, ok 5, too_close 0",
-        "samples: p0 16.0, p10 22.4, p50 64.0, p90 64.0, p100 64.0",
+        "samples: p0 16.0, p10 22.4, p50 48.0, p90 64.0, p100 64.0",
         "estimated_error: p0 0.001, p10 0.001, p50 0.002, p90 0.5412, p100 0.9",
-        "share_over_target_at_max_spp = 0.4",
+        "share_over_target_at_max_spp = 0.2",
+        "stalled_views = 1",
         "noise_floor.reweighted.log_error: mean 0.003, p10 0.0014, p50 0.003, p90 0.0046",
         "noise_floor.reweighted.psnr: mean 30.0, p10 30.0, p50 30.0, p90 30.0",
         "noise_floor.sum.log_error: mean 0.002, p10 0.002, p50 0.002, p90 0.002",

@@ -22,6 +22,8 @@ NOISE_WEIGHT = 0.5  # of the mean difference between the denoised halves
 DRIFT_WEIGHT = 1.6  # of the mean difference between their mean and the denoised whole
 QUALITIES = {"fast": 1.13, "high": 1.0}  # the denoiser's networks: what the estimate is to be multiplied by
 HIGH = 0.8  # error of the large network over that of the small one, in the median
+STALL_FROM = 32  # samples: estimates of fewer tell little
+STALL_SLOPE = 0.2  # error ~ samples^-slope; 0.5 is noise that is independent from sample to sample, denoised a little less
 HOPE = 0.6  # least error of the large network over that of the small one
 
 
@@ -30,20 +32,36 @@ class Judge:
 
     def __init__(self, target: float, denoised: bool):
         self.target, self.network = target, "fast" if denoised else None
+        self.told: list[tuple[int, float]] = []  # samples and errors, by one and the same network
 
-    def error(self, a: ViewRecord, b: ViewRecord, all_samples: ViewRecord) -> tuple[str | None, float]:
+    def error(self, samples: int, a: ViewRecord, b: ViewRecord, all_samples: ViewRecord) -> tuple[str | None, float]:
         """(network, error) of the image with all lights on, from the views of both halves and of all samples, not denoised:
         the small network where it meets the target, the large one otherwise, None where nothing is to be denoised."""
         if self.network is None:
-            return None, 0.5 * log_error(a.image, b.image)
-        if self.network == "fast":
+            error = 0.5 * log_error(a.image, b.image)
+        elif self.network == "fast":
             error = denoised_error(a, b, all_samples, "fast")
             if error <= self.target:
                 return "fast", error
             if HOPE * error > self.target:
+                self.told.append((samples, error * HIGH))
                 return "high", error * HIGH
+            self.told = []
             self.network = "high"  # if this does not do, the small one will not do with a few samples more
-        return "high", denoised_error(a, b, all_samples, "high")
+        if self.network == "high":
+            error = denoised_error(a, b, all_samples, "high")
+        self.told.append((samples, error))
+        return self.network, error
+
+    def stalled(self, samples: int, most: int) -> bool:
+        """Whether the error falls so slowly that the target is out of reach of ``most`` samples, told from the last estimate
+        and one of a quarter of its samples or less."""
+        last, error = self.told[-1] if self.told else (0, 0.0)
+        before = [told for told in self.told if STALL_FROM <= told[0] <= last / 4]
+        if last != samples or not before:
+            return False
+        slope = -np.log(error / before[-1][1]) / np.log(last / before[-1][0])
+        return bool(slope < STALL_SLOPE and error * (last / most) ** max(slope, 0) > self.target)
 
 
 def denoised_error(a: ViewRecord, b: ViewRecord, all_samples: ViewRecord, quality: str) -> float:

@@ -13,6 +13,8 @@ lanes of a vector stay busy, and nothing is added by atomics. The host adds a pi
 
 from __future__ import annotations
 
+import functools
+import operator
 from dataclasses import dataclass
 
 import drjit as dr
@@ -20,12 +22,13 @@ import mitsuba as mi
 import numpy as np
 
 from stages.renderformer.records import SceneRecord
+from stages.renderformer.rendering.caustics import PHOTONS, PORTION, SHARE, Film, LightPaths, Photons, narrow_triangles
 from stages.renderformer.rendering.guiding import Guide, Trail, Unguided
 from stages.renderformer.rendering.lights import SLOTS, LightTable
 from stages.renderformer.rendering.material import Material
 from stages.renderformer.rendering.sobol import Sampler, mixed
 from stages.renderformer.rendering.sums import Sums
-from stages.renderformer.rendering.surfaces import Surfaces, gatherable, shape_mesh
+from stages.renderformer.rendering.surfaces import Surfaces, gatherable, mesh_of, shape_mesh
 
 BLOCKS = (8, 64)  # samples of a lane, least and most
 LANES = 1 << 15  # of a view: enough to keep processors busy, so that lanes take more samples each
@@ -36,7 +39,7 @@ FILTER_CELLS = 1024
 BLACKMAN_HARRIS_SPAN = 3.0  # pixels from end to end: what Blender calls a width of 1.5
 # Dimensions of a bounce for the sampler; camera rays come before the first bounce.
 LIGHT_AND_LOBE, LIGHT_POINT, DIRECTION, ROULETTE, DIMENSIONS = range(5)
-GUIDE = 1 << 16  # behind those of all bounces: guided or not, the others stay as they are
+GUIDE, PHOTON = 1 << 16, 1 << 17  # behind those of all bounces: used or not, the others stay as they are
 FILM = 0xFFFFFFFF
 
 
@@ -76,6 +79,7 @@ class Cameras:
         self.pose = gatherable(scene.camera_to_world[:, :3].reshape(-1, 12))
         self.focal = gatherable(0.5 / np.tan(0.5 * np.radians(scene.fov_deg.astype(np.float64))))  # image height 1
         self.filter = gatherable(filter_offsets(filter_name))
+        self.pixels = size[0] * size[1]  # of a view
         self.height, self.width = (dr.opaque(mi.UInt32, side) for side in size)
         self.aspect = dr.opaque(mi.Float, size[1] / size[0])
 
@@ -93,6 +97,23 @@ class Cameras:
             *[entry[4 * axis] * local.x + entry[4 * axis + 1] * local.y + entry[4 * axis + 2] * local.z for axis in range(3)]
         )
         return mi.Ray3f(mi.Point3f(entry[3], entry[7], entry[11]), dr.normalize(direction))
+
+    def project(self, view: mi.UInt32, point: mi.Point3f) -> tuple[mi.Point3f, mi.UInt32, mi.Float]:
+        """The camera's position, the pixel (row by row) of the view in which it sees ``point``, and how many pixels an area
+        about the point that faces the camera covers, over that area; 0 where it is out of the picture. For a box filter."""
+        entry = [dr.gather(mi.Float, self.pose, 12 * view + index) for index in range(12)]
+        eye = mi.Point3f(entry[3], entry[7], entry[11])
+        way = point - eye
+        right, up, back = (mi.Vector3f(entry[axis], entry[4 + axis], entry[8 + axis]) for axis in range(3))
+        depth = -dr.dot(back, way)
+        height, width = mi.Float(self.height), mi.Float(self.width)
+        scale = dr.gather(mi.Float, self.focal, view) * height
+        column = dr.dot(right, way) / depth * scale + 0.5 * width
+        row = 0.5 * height - dr.dot(up, way) / depth * scale
+        inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        pixel = mi.UInt32(dr.select(inside, row, 0)) * self.width + mi.UInt32(dr.select(inside, column, 0))
+        distance2 = dr.squared_norm(way)
+        return eye, pixel, dr.select(inside, scale * scale * dr.sqrt(distance2) / (depth * depth * depth), 0)
 
     def _offset(self, u: mi.Float) -> mi.Float:
         u = u * FILTER_CELLS
@@ -118,6 +139,7 @@ class Lanes:
     start: Cameras | Points
     pixel: mi.UInt32
     view: mi.UInt32
+    stream: mi.UInt32  # index among those that are traced
     key: mi.UInt32  # of the random numbers
     first: mi.UInt32  # number of the first sample
     count: mi.UInt32  # samples
@@ -128,12 +150,13 @@ def _add(slots: list, slot: mi.Int32, value: mi.Color3f) -> list:
 
 
 @dr.syntax
-def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start, guide):
+def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start, photons, guide):
     """Sums over the samples of each lane: (light slots, direct, albedo, normal, distance, hits, nearest distance, triangle).
 
     ``limits``: opaque (bounces, diffuse bounces, glossy bounces, indirect clamp on the sum over RGB). ``hide``: opaque
     bool, camera rays pass through lights. The triangle is that of the first sample, -1 where it hit nothing.
-    ``diffuse_start``: the first surface is a white diffuse one, whatever its material. ``guide`` learns, and picks directions.
+    ``diffuse_start``: the first surface is a white diffuse one, whatever its material. ``photons``: light
+    that light paths have left; what belongs to those is left out (``caustics``). ``guide`` learns, and picks directions.
     """
     max_bounces, max_diffuse, max_glossy, clamp = limits
     slots = [mi.Color3f(0) for _ in range(SLOTS)]
@@ -147,6 +170,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
     fresh = mi.Bool(True)
     throughput, bsdf_pdf, widest = mi.Color3f(1), mi.Float(0), mi.Float(dr.inf)  # widest: least density so far
     bounce, diffuse, glossy = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+    # shares of the throughput: narrow from the first surface on; narrow at the last surface, but not at all before
+    pure, theirs = mi.Color3f(1), mi.Color3f(0)
     trail = Trail.none()
 
     while done < lanes.count:
@@ -182,6 +207,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         light_pdf = dr.gather(mi.Float, lights.density, si.prim_index, hit) * si.t * si.t / dr.maximum(cosine, 1e-9)
         weight = dr.select(bounce == 0, 1, mis_weight(bsdf_pdf, light_pdf))
         value = throughput * dr.gather(mi.Color3f, lights.emission, si.prim_index, hit) * weight
+        if photons is not None:
+            value *= 1 - theirs
         value = dr.select(hit, clamped(value, dr.select(bounce > 1, clamp, dr.inf)), 0)
         slots = _add(slots, slot, value)
         direct += dr.select(bounce <= 1, value, 0)
@@ -195,6 +222,12 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         if diffuse_start:
             white = bounce == 0
             lobes.diffuse, lobes.specular = dr.select(white, 1, lobes.diffuse), dr.select(white, 0, lobes.specular)
+        if photons is not None:  # those that were left about a first surface are joined to the cameras themselves
+            later = surface & (bounce > 0)
+            picked = sampler.one(dimension + PHOTON)
+            slot, value = photons.meet(lanes.stream, bounce, max_bounces, si, lobes, material, picked, later)
+            value = clamped(throughput * value, dr.select(later, clamp, dr.inf))
+            slots = _add(slots, slot, value)
         spot = guide.at(lanes.view, si, lobes, surface)
         choice = sampler.two(dimension + LIGHT_AND_LOBE)
         lit, point = lights.sample(choice.x, sampler.two(dimension + LIGHT_POINT))
@@ -205,7 +238,10 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         cosine = dr.abs(dr.dot(dr.gather(mi.Normal3f, lights.normal, lit), to_light))
         density = dr.gather(mi.Float, lights.density, lit)
         sampled = surface & (cosine > 0) & (distance2 > 0) & (density > 0)
-        reflected, pdf = material.evaluate(lobes, si.wi, si.to_local(to_light))
+        dull, bright, pdf = material.evaluate_lobes(lobes, si.wi, si.to_local(to_light))
+        reflected = dull + bright
+        if photons is not None:
+            reflected = dull + bright * dr.select(lobes.is_narrow, pure, 1)
         sampled &= dr.max(reflected) > 0
         sampled &= ~scene.ray_test(shadow, sampled)
         light_pdf = density * distance2 / dr.maximum(cosine, 1e-9)
@@ -220,7 +256,12 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         within = sampler.two(dimension + DIRECTION)
         wo, is_glossy = material.sample(lobes, si.wi, choice.y, within)
         wo = guide.direction(wo, spot, si, sampler.two(dimension + GUIDE), within)
-        scattered, pdf = material.evaluate(lobes, si.wi, wo)
+        dull, bright, pdf = material.evaluate_lobes(lobes, si.wi, wo)
+        scattered = dull + bright
+        if photons is not None:
+            narrow = dr.select(lobes.is_narrow & (scattered > 0), bright / scattered, 0)
+            theirs = dr.select(surface, narrow * (1 - pure), theirs)
+            pure = dr.select(surface, narrow * pure, pure)
         direction, arriving = si.to_world(wo), mi.Color3f(throughput)
         pdf = guide.density(pdf, spot, direction)
         glossy += dr.select(surface & is_glossy, 1, 0)
@@ -240,6 +281,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         done += dr.select(fresh, 1, 0)
         throughput, bsdf_pdf = dr.select(fresh, 1, throughput), dr.select(fresh, 0, bsdf_pdf)
         widest = dr.select(fresh, dr.inf, widest)
+        if photons is not None:
+            pure, theirs = dr.select(fresh, 1, pure), dr.select(fresh, 0, theirs)
         trail = guide.step(trail, spot, direction, arriving, fresh)
         bounce, diffuse, glossy = [dr.select(fresh, 0, count) for count in (bounce, diffuse, glossy)]
 
@@ -262,7 +305,14 @@ class JitRenderer:
     """One scene, ready to be seen from its cameras."""
 
     def __init__(
-        self, scene: SceneRecord, size: tuple[int, int], seed: int, limits: Limits, lights_visible: bool, guided: bool = False
+        self,
+        scene: SceneRecord,
+        size: tuple[int, int],
+        seed: int,
+        limits: Limits,
+        lights_visible: bool,
+        guided: bool = False,
+        light_paths: bool = False,
     ):
         self.record, self.size, self.seed = scene, size, seed  # (height, width)
         self.pixels = size[0] * size[1]  # of a view
@@ -271,9 +321,17 @@ class JitRenderer:
         self.scene = mi.load_dict({"type": "scene", "surface": shape_mesh(scene, surfaces)})
         self.material = Material(surfaces, limits.multiscatter)
         self.passes = [LightTable(scene, first) for first in range(0, max(scene.n_lights, 1), SLOTS)]
-        self.guided = guided
-        self.guides = [Guide(scene) if guided else Unguided() for _ in self.passes]
         self.cameras = Cameras(scene, size, limits.filter)
+        self.light_paths = None
+        narrow = narrow_triangles(surfaces)
+        if light_paths and limits.bounces > 1 and scene.n_lights and len(narrow[0]):
+            within = self.passes, seed, self.pixels, limits.bounces
+            self.light_paths = LightPaths(scene, self.scene, self.material, narrow, *within)
+            hidden = (scene.light_index >= 0) & (not lights_visible)
+            seen = mesh_of(scene.triangles[~hidden], None)
+            self.before_cameras = mi.load_dict({"type": "scene", "surface": seen})
+        self.guided = guided and not self.light_paths  # what guiding finds best is what light paths bring
+        self.guides = [Guide(scene) if self.guided else Unguided() for _ in self.passes]
 
     def learn(self, views: list[int]) -> None:
         """Guide the paths of these views from now on by what those so far have brought."""
@@ -286,7 +344,7 @@ class JitRenderer:
         Sums over ``spp`` samples: ``lights`` (N, L, 3); and ``triangle`` (N,), which ``height`` above the point is met first.
         """
         start, ids = Points(points, normals, height), np.arange(len(points))
-        passes = [self._pass(table, number, start, ids, [0], 0, spp) for number, table in enumerate(self.passes)]
+        passes = [self._pass(table, number, start, None, ids, [0], 0, spp) for number, table in enumerate(self.passes)]
         lights = np.concatenate([p["lights"][0] for p in passes], axis=-2)[:, : self.record.n_lights]
         return {"lights": lights, "triangle": passes[0]["triangle"][0]}
 
@@ -295,8 +353,21 @@ class JitRenderer:
 
         Streams share no path. A path serves all lights.
         """
+        if self.light_paths and spp > PORTION:
+            portions = [
+                self.sample(views, streams, begin, min(PORTION, first + spp - begin))
+                for begin in range(first, first + spp, PORTION)
+            ]
+            of_streams = [zip(*of_stream, strict=True) for of_stream in zip(*portions, strict=True)]
+            return [[functools.reduce(operator.add, of_view) for of_view in of_stream] for of_stream in of_streams]
         ids = np.concatenate([view * self.pixels + np.arange(self.pixels) for view in views])
-        passes = [self._pass(table, number, self.cameras, ids, streams, first, spp) for number, table in enumerate(self.passes)]
+        passes = []
+        for number, table in enumerate(self.passes):
+            photons = None
+            if self.light_paths:
+                paths = min(int(SHARE * self.pixels * spp), PHOTONS)
+                photons = self.light_paths.photons(number, streams, self.pixels * first, paths)
+            passes.append(self._pass(table, number, self.cameras, photons, ids, streams, first, spp))
         shape = (len(streams), len(views), *self.size)
         lights = np.concatenate([p["lights"] for p in passes], axis=-2)[..., : self.record.n_lights, :]
         hit = passes[0]  # the camera rays of all passes are the same
@@ -308,11 +379,23 @@ class JitRenderer:
             for stream in range(len(streams))
         ]
 
+    def add_caustics(self, sums: list[Sums], views: list[int], stream: int, windows: list[tuple[int, int]]) -> None:
+        """Add to the sums of each of the ``views`` what the stream's light paths bring, from the first to the last but one of
+        the view's window."""
+        lights = []
+        for number, table in enumerate(self.passes):
+            film = Film(self.cameras, self.before_cameras, table.slots, views, np.asarray(windows))
+            self.light_paths.trace(number, film, stream)
+            lights.append(film.light().reshape(len(views), table.slots, *self.size, 3))
+        for of_view, caustics, (first, last) in zip(sums, np.concatenate(lights, axis=1), windows, strict=True):
+            of_view.caustics, of_view.paths = of_view.caustics + caustics, of_view.paths + last - first
+
     def _pass(
         self,
         table: LightTable,
         number: int,
         rays: Cameras | Points,
+        photons: Photons | None,
         ids: np.ndarray,
         streams: list[int],
         first: int,
@@ -331,8 +414,14 @@ class JitRenderer:
                 row = np.arange(start, min(start + step, rows)).repeat(depth)
                 number_of = block + np.tile(np.arange(depth), len(row) // depth)
                 counts = np.minimum(size, spp - number_of * size)
-                where = ids[row % len(ids)], np.asarray(streams)[row // len(ids)], first + number_of * size, counts
-                for name, value in self._chunk(table, number, rays, *where).items():
+                where = (
+                    ids[row % len(ids)],
+                    np.asarray(streams)[row // len(ids)],
+                    row // len(ids),
+                    first + number_of * size,
+                    counts,
+                )
+                for name, value in self._chunk(table, number, rays, photons, *where).items():
                     parts = value.reshape(*value.shape[:-1], -1, depth)
                     part = slice(start, start + parts.shape[-2])
                     if name == "triangle":
@@ -352,8 +441,10 @@ class JitRenderer:
         table: LightTable,
         number: int,
         rays: Cameras | Points,
+        photons: Photons | None,
         pixel: np.ndarray,
         stream: np.ndarray,
+        row: np.ndarray,
         first: np.ndarray,
         count: np.ndarray,
     ) -> dict[str, np.ndarray]:
@@ -362,11 +453,11 @@ class JitRenderer:
         def opaque(value: int) -> mi.UInt32:
             return dr.opaque(mi.UInt32, value & 0xFFFFFFFF)
 
-        places = (pixel, stream, pixel // self.pixels, first, count)
-        ids, streams, views, first, count = (gatherable(values, mi.UInt32) for values in places)
+        places = (pixel, stream, row, pixel // self.pixels, first, count)
+        ids, streams, row, views, first, count = (gatherable(values, mi.UInt32) for values in places)
         # the first two steps are one to one in the pixel: no two pixels of a stream share their numbers
         key = mixed(mixed(mixed(ids + opaque(self.seed)) + opaque(self.seed >> 32)) + streams)
-        lanes = Lanes(rays, ids, views, key, first, count)
+        lanes = Lanes(rays, ids, views, row, key, first, count)
         limits = self.limits
         bounds = (
             opaque(limits.bounces),
@@ -378,7 +469,9 @@ class JitRenderer:
         pass_key = opaque(number * 0x5851F42D)
         white = isinstance(rays, Points)
         guide = Unguided() if white else self.guides[number]
-        out = trace_paths(self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, guide)
+        out = trace_paths(
+            self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, photons, guide
+        )
         dr.eval(out)
         slots, *wide, distances, hits, nearest, triangle = out
         size = len(pixel)

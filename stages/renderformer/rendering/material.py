@@ -17,6 +17,7 @@ import numpy as np
 from stages.renderformer.rendering.surfaces import MIN_ALPHA, Surfaces, atlas_texture, gatherable
 
 CELLS = 32  # of the tables of directional albedo, per axis
+NARROW_ALPHA = 0.1  # GGX width under which the specular lobe is a narrow part of the material, else of its wide part
 
 
 @cache
@@ -62,6 +63,15 @@ class Lobes:
         bright, dull = dr.max(self.specular), dr.max(self.diffuse)
         return bright / dr.maximum(bright + dull, 1e-20)
 
+    @property
+    def is_narrow(self) -> mi.Bool:
+        return self.alpha < NARROW_ALPHA
+
+    def part(self, narrow: bool) -> Lobes:
+        """The narrow or the wide part."""
+        specular = dr.select(self.is_narrow == narrow, self.specular, 0)
+        return Lobes(mi.Color3f(0) if narrow else self.diffuse, specular, self.alpha)
+
 
 class Material:
     """The lobes of a scene's triangles, of which ``surfaces`` are all; emitting ones are black."""
@@ -88,6 +98,11 @@ class Material:
 
     def evaluate(self, lobes: Lobes, wi: mi.Vector3f, wo: mi.Vector3f) -> tuple[mi.Color3f, mi.Float]:
         """BSDF times cosine, and density per solid angle of `sample`, for directions in the shading frame."""
+        diffuse, specular, density = self.evaluate_lobes(lobes, wi, wo)
+        return diffuse + specular, density
+
+    def evaluate_lobes(self, lobes: Lobes, wi: mi.Vector3f, wo: mi.Vector3f) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
+        """As `evaluate`, with the diffuse and the specular lobe's part of the first apart."""
         side = dr.select(wi.z < 0, -1, 1)  # seen from below: the same material
         wi, wo = mi.Vector3f(wi.x, wi.y, wi.z * side), mi.Vector3f(wo.x, wo.y, wo.z * side)
         above = (wi.z > 0) & (wo.z > 0)
@@ -96,9 +111,10 @@ class Material:
         seen, lit = facets.smith_g1(wi, half), facets.smith_g1(wo, half)
         shape = facets.eval(half) / (4 * dr.maximum(wi.z, 1e-12))
         masked = dr.select((seen > 0) & (lit > 0), 1 / (1 / seen + 1 / lit - 1), 0)
-        value = lobes.diffuse * (dr.inv_pi * wo.z) + self._specular(lobes, wi.z) * (shape * masked)
+        diffuse = lobes.diffuse * (dr.inv_pi * wo.z)
+        specular = self._specular(lobes, wi.z) * (shape * masked)
         density = dr.lerp(dr.inv_pi * wo.z, shape * seen, lobes.specular_share)
-        return dr.select(above, value, 0), dr.select(above, density, 0)
+        return dr.select(above, diffuse, 0), dr.select(above, specular, 0), dr.select(above, density, 0)
 
     def sample(self, lobes: Lobes, wi: mi.Vector3f, choice: mi.Float, spot: mi.Point2f) -> tuple[mi.Vector3f, mi.Bool]:
         """A direction in the shading frame, and whether the specular lobe gave it."""

@@ -21,6 +21,7 @@ from pipeline.errors import UserError
 from stages.graphics.denoising import denoise as denoise_layer
 from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.records import SceneRecord, ViewRecord
+from stages.renderformer.rendering.allotment import Allotment
 from stages.renderformer.rendering.error import Judge
 from stages.renderformer.rendering.settings import RenderSettings
 from stages.renderformer.rendering.sums import Sums
@@ -55,12 +56,17 @@ def render_views(
     step = min(FIRST_SPP // 2, total) if len(streams) > 1 else total
     parts: dict[int, list[Sums]] = {view: [] for view in active}  # per stream
     judges = {view: Judge(target_error, denoise) for view in active}
+    allotments = {view: Allotment(settings.size) for view in active}
     due = dict.fromkeys(active, 0.0)  # samples of a stream before which an estimate is not worth its cost
     while active:
         if sampled_spp:
             renderer.learn(active)
         sampled = renderer.sample(active, streams, sampled_spp, step)
         sampled_spp += step
+        if renderer.light_paths:
+            windows = [allotments[view].window(sampled_spp) for view in active]
+            for stream, of_views in zip(streams, sampled, strict=True):
+                renderer.add_caustics(of_views, active, stream, windows)
         unfinished = []
         for view, new in zip(active, zip(*sampled, strict=True), strict=True):
             of_streams = parts[view] = (
@@ -73,9 +79,13 @@ def render_views(
             all_samples, *halves = (part.view(scene.object_index) for part in (sums, *of_streams))
             quality, error = "high" if denoise else None, None
             if len(halves) > 1:
-                quality, error = judges[view].error(*halves, all_samples)
-            if sampled_spp == total or error is None or error <= target_error:
-                records[view] = _finish(all_samples, sums, view, quality, error, len(streams) * sampled_spp - sums.spp)
+                allotments[view].weigh(*of_streams)
+                quality, error = judges[view].error(sums.spp, *halves, all_samples)
+            done = sampled_spp == total or error is None or error <= target_error
+            stalled = not done and judges[view].stalled(sums.spp, max_spp)
+            if done or stalled:
+                records[view] = _finish(all_samples, sums, view, quality, error)
+                records[view].meta |= {"dropped": len(streams) * sampled_spp - sums.spp, "stalled": stalled}
                 del parts[view]
                 continue
             unfinished.append(view)
@@ -108,14 +118,14 @@ def _renderer(scene: SceneRecord, settings: RenderSettings, backend: dict[str, A
 
     if settings.mode == "physical":
         guided = settings.target_error > 0 and settings.max_spp > FIRST_SPP  # else there is no second portion to guide
-        return JitRenderer(scene, size, seed, Limits(depth - 1), lights_visible, guided)
+        return JitRenderer(scene, size, seed, Limits(depth - 1), lights_visible, guided, light_paths=True)
     # Cycles lets light in at the hit behind the last counted bounce, hence 12 + 1.
     bounces = min(depth - 1, 13)
     limits = Limits(bounces, 4, 4, 10.0, "blackman-harris", glossy_filter=True, multiscatter=True)
     return JitRenderer(scene, size, seed, limits, lights_visible)
 
 
-def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error: float | None, dropped: int) -> ViewRecord:
+def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error: float | None) -> ViewRecord:
     """The stored view: every light denoised on its own (quality None: not at all), and what is to be said of it."""
     nearest = float(sums.nearest.min())
     if quality:
@@ -131,7 +141,6 @@ def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error
         "status": "too_close" if nearest < MIN_DEPTH else "dark" if mean < MIN_MEAN else "ok",
         "mean": mean,
         "spp": sums.spp,
-        "dropped": dropped,
         "error": error,
         "denoiser": quality,
         "clamped": clamped_values(view),

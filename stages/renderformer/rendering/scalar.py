@@ -24,7 +24,7 @@ GAP = 1e-5  # distance of a light's side from its true plane, over the largest c
 class ScalarRenderer:
     """One scene, ready to be seen from its cameras."""
 
-    guided = False  # Mitsuba's own integrator picks directions by itself
+    guided, light_paths = False, None  # Mitsuba's own integrator picks directions by itself, and starts at the camera
 
     def __init__(self, scene: SceneRecord, size: tuple[int, int], seed: int, max_depth: int, lights_visible: bool):
         self.record, self.size, self.seed, self.max_depth = scene, size, seed, max_depth  # (height, width)

@@ -17,8 +17,9 @@ class RenderSettings:
     max_spp: camera paths per pixel for the image with all lights on, at most. The JIT integrator shares each path among all
         lights; the scalar one gives each light its share of the paths.
     target_error: bound on the estimated error of a view (``stages.renderformer.rendering.error``). A view gets 16 samples, then
-        32, 48, 64, 96, 128, 192 .. until it is met. From the second portion on, paths are guided by what the first found
-        (``stages.renderformer.rendering.guiding``). 0: ``max_spp`` at once, no guiding and no estimate.
+        32, 48, 64, 96, 128, 192 .. until it is met or out of reach. Light paths bring caustics
+        (``stages.renderformer.rendering.caustics``); in scenes without narrow surfaces, paths are guided by what the first
+        found (``stages.renderformer.rendering.guiding``). 0: ``max_spp`` at once, no guiding and no estimate.
     mode: ``physical`` or ``cycles`` (``stages.renderformer.rendering.render``).
     max_depth: longest path in segments; 2 is direct light only.
     denoise: Open Image Denoise, every light on its own.

@@ -16,6 +16,8 @@ class Sums:
     lights (L, H, W, 3), direct, albedo, normal (H, W, 3); distance (H, W) over the samples that hit something, hits (H, W)
     their number. Not sums: nearest (H, W), the smallest distance, infinite where nothing was hit; triangle (H, W) int32, what
     the first sample hit, -1 for nothing.
+    caustics (L, H, W, 3) float32: sums over ``paths`` light paths (``stages.renderformer.rendering.caustics``) of the light
+    that camera paths leave out; 0 where there are none.
     """
 
     spp: int
@@ -27,6 +29,8 @@ class Sums:
     hits: np.ndarray
     nearest: np.ndarray
     triangle: np.ndarray
+    caustics: np.ndarray | float = 0.0
+    paths: int = 0
 
     def __add__(self, other: Sums) -> Sums:
         summed = [f.name for f in fields(self) if f.name not in ("nearest", "triangle")]
@@ -40,6 +44,7 @@ class Sums:
             return (values / self.spp).astype(np.float32)
 
         depth = np.where(self.hits > 0, self.distance / np.maximum(self.hits, 1e-9), 0).astype(np.float32)
-        means = [mean(values) for values in (self.lights, self.direct, self.albedo, self.normal)]
+        lights = (self.lights / self.spp + self.caustics / max(self.paths, 1)).astype(np.float32)
+        means = [lights, *(mean(values) for values in (self.direct, self.albedo, self.normal))]
         object_at_pixel = np.where(self.triangle >= 0, object_index[self.triangle], -1).astype(np.int32)
         return ViewRecord(*means, depth, mean(self.hits), self.triangle.astype(np.int32), object_at_pixel)

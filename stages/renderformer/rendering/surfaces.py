@@ -15,6 +15,7 @@ not be linear between texels; what is interpolated of roughness is its square, t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -67,6 +68,16 @@ class Surfaces:
     @cached_property
     def atlas(self) -> Atlas:
         return Atlas(len(self.weight), self.textured)
+
+    def bound(self, name: str, of: Callable) -> np.ndarray:
+        """(F, ..) the least (``of``: np.min) or largest value of ``specular`` or ``alpha`` within each triangle."""
+        values = self.values[name].copy()
+        if name in self.varying:
+            patches = self._patches[:, PATCH_CHANNELS["specular" if name == "specular" else "roughness"]][..., PATCH_KEPT]
+            values[self.textured] = of(patches.astype(np.float32), axis=-1).reshape(values[self.textured].shape)
+            if name == "alpha":
+                values[self.textured] = np.maximum(values[self.textured] ** 2, MIN_ALPHA)
+        return values
 
     def picture(self, name: str) -> np.ndarray:
         """(height, width, channels) float32: the atlas of a parameter that varies."""
