@@ -89,7 +89,7 @@ def test_sizes_are_those_that_the_paper_states():
 
 
 def test_a_wrong_row_table_or_dataset_is_told():
-    with pytest.raises(UserError, match="table 'table2' is unknown: choose from default, priors, table1, table1_small"):
+    with pytest.raises(UserError, match="table 'table2' is unknown: choose from default, priors, shipped, table1, table1_s"):
         jobs_of("table2", None, [])
     with pytest.raises(UserError, match="no_dtp is unknown.*no_dpt"):
         jobs_of("table1_small", ["no_dtp"], [])

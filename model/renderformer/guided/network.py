@@ -260,8 +260,10 @@ class GuidedNetwork(Network):
     def gathering_layers(self) -> list[nn.Module]:
         return list(self.gather["layers"]) if self.config.tokens == "encoder" else []
 
-    def without_learning(self) -> GuidedNetwork:
-        """The closed form alone."""
+    def without_learning(self) -> GuidedNetwork | None:
+        """The closed form alone; None where the network is not given any light: that image is black."""
+        if not self.config.guide.light:
+            return None
         network = copy.deepcopy(self)
         network.head.start_at_zero()
         return network
