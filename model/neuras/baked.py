@@ -38,7 +38,9 @@ class Baked:
     mesh_mlp, sky_mlp: layers as (weight (out, in), bias (out,)) float32, see ``render``; no layers: the feature's first
     three channels are the colour. sky_opacity: one layer with one output. sky_centre: (3,) float64, world.
     sky_half_sizes: (L, 3) float64, world units (``model.neuras.skyboxes`` says where a face's texels lie).
-    view_dependent: whether the networks take the view direction. activations: by name, for who writes a shader.
+    view_dependent: whether the networks take the view direction. rays: along a pixel's side, evenly spaced; their mean is what
+    is drawn, each with the texture that the whole pixel covers. So silhouettes are smooth, as a photo's are.
+    activations: by name, for who writes a shader.
     """
 
     mesh_mlp: list[Layer]
@@ -48,6 +50,7 @@ class Baked:
     sky_half_sizes: np.ndarray
     view_dependent: bool
     levels: int = 1
+    rays: int = 1
     mesh_indices: np.ndarray | None = None
     sky_indices: np.ndarray | None = None
     mesh_codebook: np.ndarray | None = None
@@ -101,6 +104,7 @@ class Baked:
             "format": FORMAT,
             "view_dependent": self.view_dependent,
             "levels": self.levels,
+            "rays": self.rays,
             "quantized": self.quantized,
             "activations": self.activations,
             "sizes": {"mesh": list(self.mesh_size), "sky": list(self.sky_size), "channels": self.channels},
@@ -127,6 +131,7 @@ class Baked:
             networks = {name: layers(name) for name in ("mesh_mlp", "sky_mlp")}
             opacity = (arrays.pop("sky_opacity.weight"), arrays.pop("sky_opacity.bias"))
             stated = {name: values[name] for name in ("view_dependent", "levels", "activations", "meta")}
+            stated["rays"] = int(values.get("rays", 1))  # scenes had one ray a pixel before
             return cls(sky_opacity=opacity, **networks, **stated, **arrays)
         except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
             if isinstance(error, InputError):

@@ -51,6 +51,7 @@ class FitConfig:
     voxel: float = 0.3  # edge of the finest voxel that texels of the mesh share
     block: int = 4  # texels along the finest block that texels of a skybox share
     sky_side: int = 256  # texels along a face of a skybox
+    rays: int = 1  # along a pixel's side when the finished scene is drawn; fitting casts one a pixel
     near_opacity: float = 0.12  # of all skyboxes but the farthest, at the start: far layers explain first
     direction_noise: float = 0.0  # sigma added to the view direction
     exposure: bool = False  # an affine change of colour per training image
@@ -231,6 +232,7 @@ class Scene:
             sky_half_sizes=np.asarray(self.surroundings.sky_half_sizes, np.float64),
             view_dependent=shader.view_direction and shader.layers > 0,
             levels=self.pyramid.levels,
+            rays=self.config.rays,
             meta=meta,
             **arrays,
         )

@@ -65,6 +65,11 @@ class Camera:
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
+    def subpixels(self, side: int) -> list[Camera]:
+        """``side`` x ``side`` cameras whose pixels' centres are evenly spaced over the pixels of this one, row by row."""
+        offsets = (np.arange(side) + 0.5) / side - 0.5
+        return [replace(self, cx=self.cx - x, cy=self.cy - y) for y in offsets for x in offsets]
+
     def moved(self, offset: np.ndarray) -> Camera:
         """The same camera elsewhere. ``offset``: (3,) in world units: right, up and backwards as the camera sees them."""
         moved = self.camera_to_world.copy()

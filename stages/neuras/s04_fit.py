@@ -50,6 +50,7 @@ class FitStageConfig(StageConfig):
     sky_side: int | None = Field(None, ge=8, le=8192)  # texels along a face of a skybox; null: one per two pixels, at most 512
     sky_near_m: float = Field(150.0, gt=0)  # half size of the nearest skybox
     sky_far_m: float = Field(2400.0, gt=0)
+    rays: int = Field(2, ge=1, le=8)  # along a pixel's side, whose mean is drawn: edges are smooth
     # Optimization
     steps: int = Field(1500, ge=1)
     patch: int = Field(8, ge=2)  # pixels along a patch

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -61,6 +62,34 @@ def test_opengl_draws_what_torch_computes(settings):
     difference = np.abs(drawn - truth).max(axis=2) * 255
     assert np.median(difference[hit]) < 0.5 and np.median(difference[~hit]) < 0.5
     assert (difference > 4).mean() < 0.004  # a pixel on the silhouette may go either way
+
+
+def test_a_pixel_is_the_mean_of_its_rays():
+    """OpenGL and torch draw the same; it is what a picture of four times the size shows, with the whole pixel's texture."""
+    flat = scenes.atlas()
+    baked, camera = scenes.baked(flat, networks=False), scenes.looking_at((4.0, 3.0, 2.0), size=(60, 40))
+    one, smooth = (Reference(replace(baked, rays=rays), flat).render(camera) for rays in (1, 4))
+    with drawing.Drawing(replace(baked, rays=4), flat, 0.1, 100.0) as scene:
+        drawn = scene.render(camera)
+    difference = np.abs(drawn - smooth).max(axis=2) * 255
+    assert np.median(difference) < 0.5 and (difference > 8).mean() < 0.004
+    fine = Reference(baked, flat)
+    hit = fine.caster.view(camera.resized(240, 160)).hit.reshape(40, 4, 60, 4).mean(axis=(1, 3))
+    centre = fine.caster.view(camera).hit
+    edges = (hit > 0) & (hit < 1)
+    assert edges.mean() > 0.03
+    for covered in (hit == 0, hit == 1):  # the mean of what each ray sees lies near what the centre sees, but for the edges
+        assert np.abs(smooth - one)[covered & (centre == hit)].mean() < np.abs(smooth - one)[edges].mean()
+
+
+def test_a_picture_that_opengl_cannot_hold_is_refused():
+    flat = scenes.atlas()
+    camera, told = scenes.looking_at((4.0, 3.0, 2.0), size=(10000, 4)), "8 rays along a pixel's side is larger than .* fit.rays"
+    with (
+        drawing.Drawing(replace(scenes.baked(flat), rays=8), flat, 0.1, 100.0) as scene,
+        pytest.raises(UserError, match=told),
+    ):
+        scene.render(camera)
 
 
 def test_eight_bits_come_near():
@@ -165,7 +194,10 @@ def test_a_site_says_what_it_holds(tmp_path):
     scene = json.loads((tmp_path / "scene.json").read_bytes())
     assert [frame["name"] for frame in scene["frames"]] == ["drive_0", "drive_1", "drive_2"]
     assert {path.name for path in (tmp_path / "shaders").iterdir()} == {
-        f"{name}.{dialect}.{kind}" for name in ("mesh", "sky") for dialect in ("web", "desktop") for kind in ("vert", "frag")
+        f"{name}.{dialect}.{kind}"
+        for name in ("mesh", "sky", "resolve")
+        for dialect in ("web", "desktop")
+        for kind in ("vert", "frag")
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ def opened(tmp_path_factory):
     Image.new("RGB", SIZE, RED).save(photo, "PNG")
     cameras = [scenes.looking_at(place, size=SIZE) for place in PLACES]
     frames = [FrameRecord(f"frame-drive_{n}", camera, photo.getvalue(), "train") for n, camera in enumerate(cameras)]
-    write_site(site, scenes.baked(flat, networks=False), flat, INFO, frames, (0.1, 100.0), "fp16")
+    write_site(site, replace(scenes.baked(flat, networks=False), rays=2), flat, INFO, frames, (0.1, 100.0), "fp16")
     with browser.opened(site, size=(700, 520)) as page:
         yield page
 
@@ -216,6 +217,17 @@ def test_lists_choose_what_is_shown(page):
         alone.append(redrawn(page, alone[-1]))
     pictures += alone[1:]
     assert len({picture.tobytes() for picture in pictures}) == len(pictures) == 9
+
+
+def test_smooth_edges_are_means_of_four_rays(page):
+    smooth = page.canvas().astype(float)
+    page.click("#smooth")
+    hard = redrawn(page, smooth).astype(float)
+    page.click("#smooth")
+    until(lambda: np.array_equal(page.canvas(), smooth))
+    apart = np.abs(smooth - hard).max(axis=2)
+    assert 0.001 < (apart > 20).mean() < 0.1 and np.median(apart) <= 2  # silhouettes alone
+    assert np.abs(np.diff(smooth, axis=1)).max() <= np.abs(np.diff(hard, axis=1)).max()
 
 
 def test_the_wireframe_is_lines_over_what_lies_behind(page):

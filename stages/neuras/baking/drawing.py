@@ -10,7 +10,7 @@ import numpy as np
 from model.neuras.baked import Baked
 from pipeline.errors import UserError
 from stages.graphics.cameras import Camera
-from stages.neuras.baking.shaders import MODES, Ranges, mesh_shaders, sky_shaders, textures
+from stages.neuras.baking.shaders import MODES, Ranges, mesh_shaders, resolve_shaders, sky_shaders, textures
 from stages.neuras.records import AtlasMesh
 
 TextureFormat = Literal["fp16", "rgba8"]
@@ -60,7 +60,7 @@ class Drawing:
         self._gl = context()
         self._near, self._far = near, far
         self._centre = np.asarray(baked.sky_centre, float)
-        self._skyboxes = baked.sky_size[0]
+        self._skyboxes, self._rays = baked.sky_size[0], baked.rays
         mesh, sky = baked.mesh_texture(), baked.sky_textures()
         largest = self._gl.info["GL_MAX_TEXTURE_SIZE"]
         if max(mesh.shape[:2]) > largest:
@@ -69,6 +69,7 @@ class Drawing:
         mesh_ranges, sky_ranges = (None, None) if exact else (Ranges.of(mesh), Ranges.of(sky))
         self._mesh = self._gl.program(*mesh_shaders(baked, "desktop", mesh_ranges))
         self._sky = self._gl.program(*sky_shaders(baked, "desktop", sky_ranges))
+        self._resolve = self._gl.program(*resolve_shaders(baked, "desktop"))
         self._textures = [
             *self._upload(self._mesh, "mesh", mesh[None], mesh_ranges, array=False),
             *self._upload(self._sky, "sky", sky.reshape(-1, *sky.shape[2:]), sky_ranges, array=True),
@@ -89,7 +90,9 @@ class Drawing:
         indices = self._gl.buffer(np.ascontiguousarray(atlas.faces, np.int32).tobytes())
         self._triangles = self._gl.vertex_array(self._mesh, [(parts[0], layout, *kept)], indices)
         self._screen = self._gl.vertex_array(self._sky, [])
-        self._target: Any = None
+        self._mean = self._gl.vertex_array(self._resolve, [])
+        self._target: Any = None  # the picture, and where its rays are drawn
+        self._fine: Any = None
 
     def _upload(
         self, program: Any, name: str, maps: np.ndarray, ranges: Ranges | None, array: bool
@@ -130,8 +133,7 @@ class Drawing:
     def _draw(self, camera: Camera, mode: str, skybox: int) -> None:
         size = (camera.width, camera.height)
         if self._target is None or self._target.size != size:
-            colour = self._gl.texture(size, 4, dtype="f4")
-            self._target = self._gl.framebuffer([colour], self._gl.depth_texture(size))
+            self._target, self._fine = (self._framebuffer(camera, rays) for rays in (1, self._rays))
         pose = camera.camera_to_world
         eye = pose[:3, 3] - self._centre
         view = np.eye(4)
@@ -151,12 +153,29 @@ class Drawing:
             if name in program:
                 texture.use(unit)
                 program[name] = unit
-        self._target.use()
-        self._target.clear(0.0, 0.0, 0.0, 1.0, depth=1.0)
+        self._fine.use()
+        self._fine.clear(0.0, 0.0, 0.0, 1.0, depth=1.0)
         self._gl.enable(self._gl.DEPTH_TEST)
         self._gl.depth_func = "<="
         self._triangles.render()
         self._screen.render(vertices=3)
+        self._gl.disable(self._gl.DEPTH_TEST)
+        self._target.use()
+        self._fine.color_attachments[0].use(0)
+        self._resolve["rays"] = 0
+        self._mean.render(vertices=3)
+
+    def _framebuffer(self, camera: Camera, rays: int) -> Any:
+        size = (camera.width * rays, camera.height * rays)
+        largest = self._gl.info["GL_MAX_TEXTURE_SIZE"]
+        if max(size) > largest:
+            raise UserError(
+                f"a picture of {camera.width} x {camera.height} with {rays} rays along a pixel's side is larger than the "
+                f"{largest} pixels that OpenGL here takes: make it smaller, or fit.rays"
+            )
+        colour = self._gl.texture(size, 4, dtype="f4")
+        colour.filter = (self._gl.NEAREST, self._gl.NEAREST)
+        return self._gl.framebuffer([colour], self._gl.depth_texture(size))
 
     def finish(self) -> None:
         """Wait until all is drawn."""

@@ -49,6 +49,10 @@ void main() {       // one triangle over the whole image, at the far plane
 }
 """
 
+RESOLVE_VERTEX = """
+void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }
+"""
+
 COLOURS = """
 vec3 number_colour(float number) {  // neighbours in number differ in colour
     vec3 turn = fract(number * vec3(0.61803399, 0.75487767, 0.56984029) + vec3(0.1, 0.4, 0.7));
@@ -118,6 +122,21 @@ void main() {{
 }}
 """
     return DIALECTS[dialect] + MESH_VERTEX, DIALECTS[dialect] + body
+
+
+def resolve_shaders(baked: Baked, dialect: str) -> tuple[str, str]:
+    """Vertex and fragment shader that draw each pixel as the mean of its rays: of a picture so many times as wide and high."""
+    body = f"""
+uniform highp sampler2D rays;
+out vec4 colour;
+void main() {{
+    ivec2 corner = ivec2(gl_FragCoord.xy) * {baked.rays};
+    vec4 sum = vec4(0.0);
+    for (int i = 0; i < {baked.rays**2}; i++) sum += texelFetch(rays, corner + ivec2(i % {baked.rays}, i / {baked.rays}), 0);
+    colour = sum / {baked.rays**2}.0;
+}}
+"""
+    return DIALECTS[dialect] + RESOLVE_VERTEX, DIALECTS[dialect] + body
 
 
 def sky_shaders(baked: Baked, dialect: str, ranges: Ranges | None) -> tuple[str, str]:

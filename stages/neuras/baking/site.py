@@ -28,7 +28,7 @@ from PIL import Image
 
 from model.neuras.baked import Baked
 from stages.neuras.baking.drawing import lens
-from stages.neuras.baking.shaders import MODES, Ranges, mesh_shaders, sky_shaders, textures
+from stages.neuras.baking.shaders import MODES, Ranges, mesh_shaders, resolve_shaders, sky_shaders, textures
 from stages.neuras.records import FRAME, AtlasMesh, CaptureInfo, FrameRecord
 
 PAGE = Path(__file__).parent / "page"
@@ -65,8 +65,13 @@ def write_site(
                 part = np.ascontiguousarray(values[..., 4 * index : 4 * index + 4])
                 Image.fromarray(part, "RGBA").save(folder / f"{name}_{index}.png")
     for dialect in ("web", "desktop"):
-        for name, make in (("mesh", mesh_shaders), ("sky", sky_shaders)):
-            for kind, text in zip(("vert", "frag"), make(baked, dialect, ranges[name]), strict=True):
+        programs = {
+            "mesh": mesh_shaders(baked, dialect, ranges["mesh"]),
+            "sky": sky_shaders(baked, dialect, ranges["sky"]),
+            "resolve": resolve_shaders(baked, dialect),
+        }
+        for name, program in programs.items():
+            for kind, text in zip(("vert", "frag"), program, strict=True):
                 (folder / "shaders" / f"{name}.{dialect}.{kind}").write_text(text)
     views = [_view(folder, frame, baked.sky_centre) for frame in frames]
     layers, side = baked.sky_size
@@ -74,6 +79,7 @@ def write_site(
         "format": 1,
         "channels": baked.channels,
         "textures": textures(baked.channels),
+        "rays": baked.rays,
         "quantized": baked.quantized,
         "expand": "rgba8" if bytes_wanted else "fp16",
         "ranges": {name: None if r is None else {"low": r.low.tolist(), "span": r.span.tolist()} for name, r in ranges.items()},

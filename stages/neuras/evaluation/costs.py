@@ -40,6 +40,7 @@ def plain(scene: Scene) -> Scene:
         sky_centre=baked.sky_centre,
         sky_half_sizes=baked.sky_half_sizes[-1:],
         view_dependent=False,
+        rays=baked.rays,
         mesh_features=np.clip(finest, 0, 1).astype(np.float16),
         sky_features=np.zeros((1, 6, side, side, 3), np.float16),
     )

@@ -26,13 +26,15 @@ class Reference:
 
     def __init__(self, baked: Baked, atlas: AtlasMesh):
         self._baked, self._atlas = baked, atlas
+        self.rays = baked.rays
         self.caster = Caster(atlas.vertices, atlas.faces)
 
     def render(self, camera: Camera) -> np.ndarray:
-        return self.shade(camera, self.caster.view(camera))
+        rays = (self.shade(ray, self.caster.view(ray)) for ray in camera.subpixels(self.rays))
+        return sum(rays, np.float32(0)) / np.float32(self.rays**2)
 
     def shade(self, camera: Camera, view: GBuffer) -> np.ndarray:
-        """The picture of a camera whose view of the mesh is known."""
+        """One ray a pixel, of a camera whose view of the mesh is known."""
         uv = view.interpolate(self._atlas.faces, self._atlas.uvs).reshape(-1, 2)
         rays = camera.directions().reshape(-1, 3)
         covered = footprint(view, camera, self._atlas)

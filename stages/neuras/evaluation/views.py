@@ -78,7 +78,7 @@ class Examiner:
         if self.aligner is not None:
             frame = replace(frame, camera=self.aligner.align(frame.camera, photo, known))
         seen = self.reference.caster.view(frame.camera)
-        exact = self.reference.shade(frame.camera, seen)
+        exact = self.reference.render(frame.camera)
         warped, covered = self.warping.render(frame.camera)
         drawn = {kind: drawing.render(frame.camera) for kind, drawing in self.drawings.items()}
         pictures = {"ours": as_bytes(exact), "warping": as_bytes(warped)}
@@ -116,7 +116,7 @@ def warping(photos: Photos, reference: Reference, radius: float, nearest: int) -
         image = frame.image().astype(np.float32) / 255
         return Source(frame.camera, image, frame.counts(), reference.caster.view(frame.camera))
 
-    return Warping(reference.caster, photos.cameras, source, radius, nearest)
+    return Warping(reference.caster, photos.cameras, source, radius, nearest, reference.rays)
 
 
 def difference(photo: np.ndarray, picture: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -33,20 +33,31 @@ class Warping:
     """A renderer of new views from photos.
 
     cameras: of all sources. source: gives one by its number; photos may be many, so nobody holds them all. radius: the
-    scene's, world units. nearest: so many sources are used for a view.
+    scene's, world units. nearest: so many sources are used for a view. rays: along a pixel's side, whose mean is drawn.
     """
 
     def __init__(
-        self, caster: Caster, cameras: Sequence[Camera], source: Callable[[int], Source], radius: float, nearest: int = 4
+        self,
+        caster: Caster,
+        cameras: Sequence[Camera],
+        source: Callable[[int], Source],
+        radius: float,
+        nearest: int = 4,
+        rays: int = 1,
     ):
         self.caster = caster
         self.positions = np.array([camera.position for camera in cameras])
         self.source = source
         self.far = radius * FAR
-        self.nearest = nearest
+        self.nearest, self.rays = nearest, rays
 
     def render(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """The view, (H, W, 3) float32 in [0, 1], and (H, W) bool: pixels that a source sees.
+        """The view, (H, W, 3) float32 in [0, 1], and (H, W) bool: pixels that a source sees with all their rays."""
+        images, seen = zip(*(self._cast(ray) for ray in camera.subpixels(self.rays)), strict=True)
+        return np.mean(images, axis=0, dtype=np.float32), np.all(seen, axis=0)
+
+    def _cast(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """The same with one ray a pixel.
 
         Of the sources that see a pixel, the nearer camera weighs more. Pixels that none sees take the nearest pixel's
         colour.

@@ -65,7 +65,7 @@ export async function loadScene(say) {
   };
   const text = async (name) => (await bytes(name)).text();
   scene.shaders = {};
-  for (const name of ["mesh", "sky"])
+  for (const name of ["mesh", "sky", "resolve"])
     scene.shaders[name] = [await text(`shaders/${name}.web.vert`), await text(`shaders/${name}.web.frag`)];
   scene.geometry = readGeometry(await (await bytes("geometry.glb")).arrayBuffer());
   if (scene.quantized) {

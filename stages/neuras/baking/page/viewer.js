@@ -51,6 +51,7 @@ class Viewer {
     this.mode = 0;
     this.skybox = -1;
     this.wireframe = false;
+    this.smooth = true;
     this.keys = new Set();
     this.times = [];
     this.driving = null;
@@ -65,6 +66,8 @@ class Viewer {
       throw new Error(`The texture is ${mesh.width} x ${mesh.height}; this browser takes ${largest}. Bake a smaller one: atlas.size=${largest}`);
     this.mesh = this.program(scene.shaders.mesh);
     this.sky = this.program(scene.shaders.sky);
+    this.resolve = this.program(scene.shaders.resolve);
+    this.largest = largest;
     this.textures = [];
     for (let i = 0; i < scene.textures; i++) {
       this.textures.push([this.mesh, `mesh${i}`, gl.TEXTURE_2D, this.upload(gl.TEXTURE_2D, scene.meshMaps[i], mesh.width, mesh.height)]);
@@ -101,6 +104,25 @@ class Viewer {
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, edges, gl.STATIC_DRAW);
     this.counts = { triangles: faces.length, edges: edges.length };
     this.nothing = gl.createVertexArray();
+  }
+
+  // Where the rays of each pixel are drawn, so many along its side; kept until the size changes.
+  raysBuffer(width, height) {
+    const { gl } = this;
+    if (this.fine?.width === width && this.fine.height === height) return this.fine;
+    if (this.fine) { gl.deleteTexture(this.fine.colour); gl.deleteRenderbuffer(this.fine.depth); gl.deleteFramebuffer(this.fine.frame); }
+    const frame = gl.createFramebuffer(), colour = gl.createTexture(), depth = gl.createRenderbuffer();
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, colour);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA8, width, height);
+    this.clampTo(gl.TEXTURE_2D, gl.NEAREST);
+    gl.bindRenderbuffer(gl.RENDERBUFFER, depth);
+    gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, colour, 0);
+    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
+    this.fine = { width, height, frame, colour, depth };
+    return this.fine;
   }
 
   program([vertex, fragment]) {
@@ -155,7 +177,12 @@ class Viewer {
     const { gl, scene } = this;
     this.resize();
     const pose = this.camera();
-    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    const { width, height } = this.canvas;
+    const wanted = this.smooth && !this.wireframe ? scene.rays : 1; // lines would fade
+    const rays = Math.max(width, height) * wanted > this.largest ? 1 : wanted;
+    const fine = rays > 1 ? this.raysBuffer(width * rays, height * rays) : null;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, fine ? fine.frame : null);
+    gl.viewport(0, 0, width * rays, height * rays);
     gl.clearColor(0, 0, 0, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
@@ -187,6 +214,15 @@ class Viewer {
     set(this.sky, "mode", "uniform1i", this.mode);
     set(this.sky, "only", "uniform1i", this.skybox);
     gl.bindVertexArray(this.nothing);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    if (!fine) return;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
+    gl.disable(gl.DEPTH_TEST);
+    gl.useProgram(this.resolve);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, fine.colour);
+    set(this.resolve, "rays", "uniform1i", 0);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
@@ -300,6 +336,8 @@ function controls(viewer) {
   element("previous").onclick = () => viewer.goTo(viewer.frame - 1);
   element("next").onclick = () => viewer.goTo(viewer.frame + 1);
   element("wireframe").onchange = (event) => { viewer.wireframe = event.target.checked; };
+  element("smooth").onchange = (event) => { viewer.smooth = event.target.checked; };
+  element("smooth").parentElement.hidden = scene.rays === 1;
   element("compare").onchange = (event) => {
     for (const id of ["photo", "split"]) element(id).hidden = !event.target.checked;
     if (event.target.checked) viewer.goTo(viewer.frame);
