@@ -77,7 +77,6 @@ class Examiner:
         known, unknown = (counts & half for half in halves(counts.shape))
         if self.aligner is not None:
             frame = replace(frame, camera=self.aligner.align(frame.camera, photo, known))
-        seen = self.reference.caster.view(frame.camera)
         exact = self.reference.render(frame.camera)
         warped, covered = self.warping.render(frame.camera)
         drawn = {kind: drawing.render(frame.camera) for kind, drawing in self.drawings.items()}
@@ -90,7 +89,7 @@ class Examiner:
             counts = unknown
         errors = None
         if frame.depth is not None:
-            depths = (seen.depth, frame.depth)
+            depths = (self.reference.caster.view(frame.camera).depth, frame.depth)
             errors = scores.error_places(photo, pictures["ours"], counts, *depths, self.depth_tolerance)
         facts = {
             "id": frame.id,

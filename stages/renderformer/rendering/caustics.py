@@ -27,7 +27,7 @@ import numpy as np
 
 from stages.graphics.geometry.measure import normal_vectors
 from stages.renderformer.records import SceneRecord
-from stages.renderformer.rendering.lights import SLOTS, LightTable
+from stages.renderformer.rendering.lights import SLOTS, LightTable, point_within
 from stages.renderformer.rendering.material import NARROW_ALPHA, Material
 from stages.renderformer.rendering.sobol import Sampler, mixed
 from stages.renderformer.rendering.surfaces import Surfaces, gatherable
@@ -98,9 +98,7 @@ class Starts:
     def sample(self, slot: mi.UInt32, pick: mi.Float, spot: mi.Point2f) -> tuple[mi.UInt32, mi.Point3f, mi.Float]:
         """A triangle, a point spread evenly over it, and the density of that point per unit area."""
         entry = dr.minimum(self._search(slot * self.count, pick), self.count - 1)
-        a, b, c = [dr.gather(mi.Point3f, self.vertices, 3 * entry + corner) for corner in range(3)]
-        root = dr.sqrt(spot.x)
-        point = a * (1 - root) + b * (root * (1 - spot.y)) + c * (root * spot.y)
+        point = point_within(self.vertices, entry, spot)
         return dr.gather(mi.UInt32, self.triangle, entry), point, dr.gather(mi.Float, self.density, slot * self.count + entry)
 
     @dr.syntax

@@ -65,6 +65,11 @@ class LightTable:
         keep = u - mi.Float(cell) < dr.gather(mi.Float, self.threshold, cell)
         cell = dr.select(keep, cell, dr.gather(mi.UInt32, self.alias, cell))
         triangle = dr.gather(mi.UInt32, self.triangle, cell)
-        a, b, c = [dr.gather(mi.Point3f, self.vertices, 3 * triangle + corner) for corner in range(3)]
-        root = dr.sqrt(spot.x)
-        return triangle, a * (1 - root) + b * (root * (1 - spot.y)) + c * (root * spot.y)
+        return triangle, point_within(self.vertices, triangle, spot)
+
+
+def point_within(vertices: mi.Float, triangle: mi.UInt32, spot: mi.Point2f) -> mi.Point3f:
+    """A point spread evenly over a triangle, from numbers in [0, 1). ``vertices``: three for each triangle."""
+    a, b, c = [dr.gather(mi.Point3f, vertices, 3 * triangle + corner) for corner in range(3)]
+    root = dr.sqrt(spot.x)
+    return a * (1 - root) + b * (root * (1 - spot.y)) + c * (root * spot.y)
