@@ -65,7 +65,7 @@ data train eval: setup
 	@$(RUN) -m pipeline system=$(SYSTEM) stage=$@ $(ARGS)
 else
 data: setup
-	@$(RUN) -m pipeline stage=data shard.guides=true $(ARGS)
+	@$(RUN) -m pipeline stage=data shard=guided $(ARGS)
 
 train: setup
 	@$(RUN) -m stages.cli sweep $(DEFAULT) --until train $(ARGS)
@@ -75,7 +75,7 @@ eval: setup
 endif
 
 probes: setup
-	@$(RUN) -m pipeline stage=probe $(if $(DEFAULT),shard.guides=true) probe=$(subst $(EMPTY) $(EMPTY),$(COMMA),$(PROBES)) -m $(ARGS)
+	@$(RUN) -m pipeline stage=probe $(if $(DEFAULT),shard=guided) probe=$(subst $(EMPTY) $(EMPTY),$(COMMA),$(PROBES)) -m $(ARGS)
 
 sweep: setup
 	@$(RUN) -m stages.cli sweep $(TABLE) $(if $(filter-out renderformer,$(SYSTEM)),system=$(SYSTEM)) $(ARGS)

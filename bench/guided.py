@@ -19,8 +19,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from model.renderformer.guided.inputs import Scenes  # noqa: E402
-from model.renderformer.guided.network import Pixels  # noqa: E402
+from model.renderformer.guided.pixels import Pixels  # noqa: E402
 from pipeline.store import Artifact  # noqa: E402
 from stages.renderformer.dataset import decode_sample  # noqa: E402
 from stages.renderformer.guides import GuideCaster  # noqa: E402
@@ -43,11 +42,11 @@ def parts(model: Any, scene: Any, view: int, side: int, repeats: int) -> list[fl
     batch, seen_by = network_arrays(model, scene, (side, side))
     caster, seen = GuideCaster(scene), seen_by(view)
     with torch.inference_mode():
-        scenes = Scenes.read(batch, "cpu")
+        scenes = model.read_scenes(batch, "cpu")
         encoded = model.encode(scenes)
         pixels = Pixels.read(seen, scenes, model.config.bundle)
         works = (
-            lambda: GuideCaster(scene).scene_guides(),
+            lambda: GuideCaster(scene).scene_guides(model.reads_bounces),
             lambda: model.encode(scenes),
             lambda: caster.view_guides(view, side, side),
             lambda: model.decode_view(encoded, pixels),

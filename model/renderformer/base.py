@@ -19,6 +19,7 @@ class Network(nn.Module, ABC):
 
     config: Any  # has ``resolution_multiple``, ``to_dict`` and ``dumps``
     reads_guides = False  # whether batches and views must hold what ray casting says of them
+    reads_bounces = False  # whether also what rays from its triangles hit
     whole_views = True  # whether it needs all ray bundles of a view at once
 
     @abstractmethod

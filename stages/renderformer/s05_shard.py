@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from pipeline.config import StageConfig, added
 from pipeline.errors import UserError
@@ -31,12 +31,19 @@ if TYPE_CHECKING:
 class ShardConfig(StageConfig):
     shard_mb: float = Field(256.0, gt=0)  # size that shards come near: a power of two of scenes each
     guides: bool = added(False, False)  # also hits, reflections and visibility by ray casting: what guided models read
+    bounces: bool = added(False, False)  # and what rays from both sides of every triangle hit
+
+    @model_validator(mode="after")
+    def _together(self) -> ShardConfig:
+        if self.bounces and not self.guides:
+            raise ValueError("bounces=true is an addition to guides: set shard.guides=true, too")
+        return self
 
 
 @dataclass(frozen=True)
 class Worker:
     inputs: Inputs
-    guides: bool
+    config: ShardConfig
 
 
 class Shard(MapStage):
@@ -47,7 +54,7 @@ class Shard(MapStage):
     Config = ShardConfig
 
     def slug(self, config: ShardConfig) -> str:
-        return f"{config.shard_mb:g}mb" + ("-guides" if config.guides else "")
+        return f"{config.shard_mb:g}mb" + ("-bounces" if config.bounces else "-guides" if config.guides else "")
 
     def part_size(self, config: ShardConfig, inputs: Inputs) -> int:
         """Scenes per shard: the power of two nearest to the target, by the mean bytes of a rendered scene.
@@ -68,10 +75,10 @@ class Shard(MapStage):
                 "shard.guides=true: camera rays of guides pass through lights, but render.lights_visible=true shows them; "
                 "choose one of the two"
             )
-        return Worker(inputs, config.guides)
+        return Worker(inputs, config)
 
     def process(self, worker: Worker, item: Item) -> Iterator[Record]:
-        yield merge(worker.inputs["scene"].read(item.id), worker.inputs["render"].read(item.id), worker.guides)
+        yield merge(worker.inputs["scene"].read(item.id), worker.inputs["render"].read(item.id), worker.config)
 
     def finish(self, config: ShardConfig, inputs: Inputs, draft: Any) -> None:
         """``files/``: ``index.jsonl``, ``shards.json``, ``objects.json``, and the card with its pictures."""
@@ -136,7 +143,7 @@ def note_objects(objects: dict[str, Any], meta: dict[str, Any]) -> None:
             objects.setdefault(entry["object_id"], {**origin, "scenes": 0})["scenes"] += 1
 
 
-def merge(scene: Record, render: Record, guides: bool = False) -> Record:
+def merge(scene: Record, render: Record, config: ShardConfig | None = None) -> Record:
     """One sample: the scene's arrays made compact, both metas, and the images byte for byte; the guides, where wanted.
 
     ``meta["views"]`` lists the camera index of each kept view in order, ``meta["render"]`` is what the renderer noted,
@@ -152,8 +159,8 @@ def merge(scene: Record, render: Record, guides: bool = False) -> Record:
     members = {name: render.members[name] for index in views for name in view_members(index)}
     members = {"scene.npz": encode_scene(record), **members}
     resolution = size_of(members[view_members(views[0])[0]])[0]
-    if guides:
-        members |= cast_guides(record, views, resolution)
+    if config is not None and config.guides:
+        members |= cast_guides(record, views, resolution, config.bounces)
     meta = {
         **record.meta,
         "n_triangles": len(record.triangles),
@@ -167,13 +174,13 @@ def merge(scene: Record, render: Record, guides: bool = False) -> Record:
     return Record(scene.id, {"meta.json": plain.encode(), **members})
 
 
-def cast_guides(scene: SceneRecord, views: Iterable[int], resolution: int) -> dict[str, bytes]:
+def cast_guides(scene: SceneRecord, views: Iterable[int], resolution: int, bounces: bool) -> dict[str, bytes]:
     """Members with the guides of the scene and of its views."""
     from stages.renderformer.guides import GuideCaster, guide_member
     from stages.renderformer.guides.records import SCENE_MEMBER, encode_scene_guides, encode_view_guides
 
     caster = GuideCaster(scene)
-    members = {SCENE_MEMBER: encode_scene_guides(caster.scene_guides())}
+    members = {SCENE_MEMBER: encode_scene_guides(caster.scene_guides(bounces))}
     for view in views:
         members[guide_member(view)] = encode_view_guides(caster.view_guides(view, resolution, resolution))
     return members

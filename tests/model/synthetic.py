@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from stages.renderformer.records import SceneRecord
+
 
 def batch(
     step: int,
@@ -54,3 +56,19 @@ def batch(
         "image": (level * np.ones((scenes, views, resolution, resolution, 1))).astype(np.float32),
         "ids": [f"scene{step}_{i}" for i in range(scenes)],
     }
+
+
+def flat_scene(triangles: np.ndarray, albedo: float = 0.5) -> SceneRecord:
+    """Diffuse flat triangles (N, 3, 3) without lamps, and a camera that looks down at them."""
+    corners = np.asarray(triangles, np.float32)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    count = len(corners)
+    camera = np.eye(4, dtype=np.float32)
+    camera[2, 3] = 2
+    grey, black = np.full((count, 3), albedo, np.float32), np.zeros((count, 3), np.float32)
+    return SceneRecord(
+        "flat", corners, np.repeat(normals[:, None], 3, axis=1).astype(np.float32), grey, black,
+        np.ones(count, np.float32), black, np.full(count, -1, np.int16), np.zeros(count, np.int16), camera[None],
+        np.array([40], np.float32),
+    )  # fmt: skip

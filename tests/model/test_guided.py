@@ -15,14 +15,19 @@ from model.renderformer import checkpoint
 from model.renderformer.architectures import build, load_config
 from model.renderformer.guided.config import GuideConfig, GuidedConfig
 from model.renderformer.guided.flops import forward_flops
-from model.renderformer.guided.inputs import Surface
+from model.renderformer.guided.inputs import Scenes, Surface
 from model.renderformer.guided.light import diffuse_light, joint_masking, masking, specular_light, vector_form_factor
-from model.renderformer.guided.network import GuidedNetwork, share_lobes
+from model.renderformer.guided.network import GuidedNetwork
+from model.renderformer.guided.pixels import Observer, share_lobes
+from model.renderformer.guided.triangles import bounce
 from model.renderformer.network import to_radiance
 from model.renderformer.recipe import FitConfig
 from model.renderformer.training import fit
 from model.training.parallel import Group
-from tests.model.synthetic import batch
+from stages.renderformer.dataset.augment import scene_arrays
+from stages.renderformer.guides import GuideCaster
+from stages.renderformer.inference.predict import batched, padded_arrays
+from tests.model.synthetic import batch, flat_scene
 
 SIDE, VIEWS = 16, 2
 SMALL = {"token_dim": 24, "token_layers": 1, "token_heads": 1, "head_dim": 16, "head_layers": 1}
@@ -141,6 +146,9 @@ def guided_batch(step: int = 0, lights: int = 2, scenes: int = 2, views: int = V
         "lobe": rng.integers(-1, triangles, (*pixels, 4)).astype(np.int32),
         "lobe_weights": weights(*pixels, 4),
         "light_seen": rng.random((*pixels, 4, lights)) < 0.6,
+        "bounces": rng.integers(-1, triangles, (scenes, triangles, 2, 16)).astype(np.int32),
+        "bounces_weights": weights(scenes, triangles, 2, 16),
+        "vertex": rng.integers(0, 3 * triangles, (scenes, triangles, 3)).astype(np.int32),
     }
     guides["hit"][guides["hit"] < lights] = -1
     guides["main"] = np.where((guides["hit"] >= 0).any(-1), (guides["hit"] >= 0).argmax(-1), -1).astype(np.int32)
@@ -165,11 +173,12 @@ def image(model: GuidedNetwork, data: dict[str, Any]) -> torch.Tensor:
 
 
 RUNGS = {
-    "hits alone": GuideConfig(False, False, False, False, False),
-    "light": GuideConfig(True, False, False, False, False),
-    "mirror": GuideConfig(True, True, False, False, False),
-    "visibility": GuideConfig(True, True, False, True, False),
-    "shadow rays": GuideConfig(True, True, False, True, True),
+    "hits alone": GuideConfig(False, False, False, False, False, False),
+    "light": GuideConfig(True, False, False, False, False, False),
+    "mirror": GuideConfig(True, True, False, False, False, False),
+    "visibility": GuideConfig(True, True, False, True, False, False),
+    "shadow rays": GuideConfig(True, True, False, True, True, False),
+    "lobe": GuideConfig(bounces=False),
     "all": GuideConfig(),
 }
 
@@ -181,13 +190,16 @@ def test_before_training_the_image_is_the_closed_form(rung):
     model = network(trained=False, guide=guide)
     scenes, pixels, _ = model.arguments(data, "cpu")
     with torch.inference_mode():
-        known = model._known(model.encode(scenes), pixels)
+        encoded = model.encode(scenes)
+        known = Observer(scenes, encoded.lit, model.config.guide).know(pixels)
     rays, expected = known.rays, torch.zeros_like(known.rays.position)
     if guide.light:
         for light in range(2):
             radiance = scenes.radiance[:, None, light] * known.direct.seen[..., light, None]
             expected += rays.diffuse * known.direct.diffuse[..., light, None] * radiance
             expected += rays.specular * known.direct.specular[..., light, None] * radiance
+    if guide.bounces:
+        expected += rays.diffuse * known.bounced
     if guide.mirror or guide.lobe:
         expected += rays.specular * known.reflected.repeat_interleave(4, dim=1)
     expected = (expected * rays.there).unflatten(1, (-1, 4)).mean(dim=2) * scenes.scale[:, None, None]
@@ -249,6 +261,9 @@ def test_padding_changes_nothing():
     for name in ("triangles", "vertex_normals", "diffuse", "specular", "roughness", "emission", "mask", "guide_triangle_seen"):
         value = np.concatenate([data[name], np.zeros_like(data[name][:, :3])], axis=1)
         padded[name] = value
+    for name, nothing in (("bounces", -1), ("bounces_weights", 0), ("vertex", 0)):
+        more = np.full_like(data[f"guide_{name}"][:, :3], nothing)
+        padded[f"guide_{name}"] = np.concatenate([data[f"guide_{name}"], more], axis=1)
     padded["guide_light_triangles"] = np.pad(data["guide_light_triangles"], ((0, 0), (0, 2)), constant_values=-1)
     for name in ("guide_triangle_seen", "guide_light_seen"):
         padded[name] = np.concatenate([padded[name], np.zeros_like(padded[name])], axis=-1)
@@ -304,7 +319,8 @@ def test_textured_hits_take_their_texel():
     model = network(trained=False)
     scenes, pixels, _ = model.arguments({**data, "patch_index": index, "patches": half}, "cpu")
     with torch.inference_mode():
-        known = model._known(model.encode(scenes), pixels)
+        encoded = model.encode(scenes)
+        known = Observer(scenes, encoded.lit, model.config.guide).know(pixels)
     textured = (pixels.hit.triangle >= 5) & (pixels.hit.there[..., 0] > 0)
     bright = pixels.hit.weights[..., 1] > 0.5
     assert torch.equal(known.rays.diffuse[textured][:, 0], bright[textured].float())
@@ -320,8 +336,85 @@ def test_every_weight_learns(rung, tokens):
 
 
 def test_data_without_guides_is_refused():
-    with pytest.raises(InputError, match="reads guides, and the data has none"):
+    with pytest.raises(InputError, match=r"reads guides, and the data has none: .* shard.guides=true"):
         network().arguments(batch(0), "cpu")
+    older = {name: values for name, values in guided_batch().items() if name not in ("guide_bounces", "guide_vertex")}
+    with pytest.raises(InputError, match=r"reads bounces, and the data has none: .* shard.bounces=true"):
+        network().arguments(older, "cpu")
+    assert image(network(guide=GuideConfig(bounces=False)), older).max() > 0
+
+
+# --- radiosity --------------------------------------------------------------------------------------------------------------
+
+
+def cast(triangles: np.ndarray, albedo: float) -> Scenes:
+    """Diffuse triangles (N, 3, 3) with the rays that leave them; flat, lit by nothing."""
+    scene = flat_scene(triangles, albedo)
+    guides = GuideCaster(scene).scene_guides()
+    return Scenes.read(padded_arrays(scene) | batched(scene_arrays(guides)), "cpu")
+
+
+def grid(corner: tuple, along: tuple, across: tuple, cells: int = 8) -> np.ndarray:
+    """(2 cells^2, 3, 3) triangles of a parallelogram, their front where along x across points."""
+    corner, along, across = (np.array(vector, float) for vector in (corner, along, across))
+
+    def at(i: int, j: int) -> np.ndarray:
+        return corner + along * i / cells + across * j / cells
+
+    return np.array(
+        [
+            [at(i, j), at(i + a, j + b), at(i + c, j + d)]
+            for i in range(cells)
+            for j in range(cells)
+            for a, b, c, d in ((1, 0, 1, 1), (1, 1, 0, 1))
+        ]
+    )
+
+
+def test_in_a_closed_room_of_even_light_bounces_add_up_to_a_geometric_series():
+    faces = [
+        grid((0, 0, 0), (1, 0, 0), (0, 1, 0), 2), grid((0, 0, 1), (0, 1, 0), (1, 0, 0), 2),
+        grid((0, 0, 0), (0, 1, 0), (0, 0, 1), 2), grid((1, 0, 0), (0, 0, 1), (0, 1, 0), 2),
+        grid((0, 0, 0), (0, 0, 1), (1, 0, 0), 2), grid((0, 1, 0), (1, 0, 0), (0, 0, 1), 2),
+    ]  # fmt: skip
+    scenes = cast(np.concatenate(faces), 0.4)
+    light = torch.zeros(len(scenes.corners), 2, 4, 3)
+    light[:, 0] = torch.tensor([1.0, 2.0, 0.0])  # on fronts, which look inside
+    bounced = bounce(scenes, light)
+    expected = 0.4 / 0.6 * torch.tensor([1.0, 2.0, 0.0])  # 0.4 + 0.16 + .., of all that is left out 0.4^12
+    torch.testing.assert_close(bounced[:, 0], expected.expand(len(light), 3, 3), rtol=1e-4, atol=0)
+    assert bounced[:, 1].abs().max() == 0  # backs see the outside
+
+
+def test_one_square_lights_another_by_their_form_factor():
+    """Two unit squares face to face, one apart: 0.1998 (Howell's catalogue, C-11)."""
+    floor, roof = grid((0, 0, 0), (1, 0, 0), (0, 1, 0)), grid((0, 0, 1), (0, 1, 0), (1, 0, 0))
+    scenes = cast(np.concatenate([floor, roof]), 0.5)
+    light = torch.zeros(256, 2, 4, 3)
+    light[:128, 0] = 1
+    bounced = bounce(scenes, light)
+    assert bounced[128:, 0].mean().item() == pytest.approx(0.5 * 0.1998, rel=0.05)
+    back = bounced[:128, 0].mean().item()  # floor, roof, floor
+    assert back == pytest.approx((0.5 * 0.1998) ** 2, rel=0.1) and bounced[:, 1].abs().max() == 0
+    points, down = scenes.corners[128:].mean(dim=1), torch.tensor([0, 0, -1.0])
+    factors = diffuse_light(vector_form_factor(points[:, None], scenes.corners[None, :128]), down).sum(dim=1)
+    assert factors.max() > 1.4 * factors.min()  # above the middle of the floor it is brighter
+    assert (bounced[128:, 0].mean(dim=(1, 2)) / (0.5 * factors) - 1).abs().mean() < 0.08
+
+
+def test_light_is_smooth_across_the_triangles_of_a_surface_and_not_across_an_edge():
+    wall = grid((0, 0, 0), (0, 0, 1), (1, 0, 0))  # stands on the floor's edge
+    scenes = cast(np.concatenate([grid((0, 0, 0), (1, 0, 0), (0, 1, 0)), wall]), 0.5)
+    light = torch.rand(256, 2, 4, 3, generator=torch.Generator().manual_seed(0))
+    bounced = bounce(scenes, light)[:, 0].flatten(0, 1)
+    corners = scenes.corners.flatten(0, 1)
+    here = (corners - torch.tensor([0.5, 0, 0])).norm(dim=1) < 1e-6
+    on_floor = here & (torch.arange(768) < 384)
+    assert on_floor.sum() == 3 and (here & ~on_floor).sum() == 3
+    assert torch.allclose(bounced[on_floor], bounced[on_floor][0]) and torch.allclose(
+        bounced[here & ~on_floor], bounced[here][-1]
+    )
+    assert not torch.allclose(bounced[on_floor][0], bounced[here][-1], rtol=0.05)
 
 
 # --- checkpoints and training -------------------------------------------------------------------------------------------------
@@ -336,12 +429,23 @@ def test_a_checkpoint_is_the_same_network_again(tmp_path):
     assert torch.equal(image(again, data), image(model, data))
 
 
+def test_a_checkpoint_from_before_bounces_does_without_them(tmp_path):
+    model = network(guide=GuideConfig(bounces=False))
+    checkpoint.save(model.config, model.state_dict(), tmp_path)
+    older = json.loads((tmp_path / "config.json").read_text())
+    del older["guide"]["bounces"]
+    (tmp_path / "config.json").write_text(json.dumps(older))
+    again, _ = checkpoint.load(tmp_path)
+    assert again.config == model.config and torch.equal(image(again, guided_batch()), image(model, guided_batch()))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"architecture": "unknown"}, "architecture 'unknown' is unknown: guided, or none"),
         ({"extra": 1}, "unknown field extra"),
         ({"guide": {"light": True}}, "missing field guide.lobe, guide.mirror, guide.shadow_rays, guide.visibility"),
+        ({"guide": {**vars(GuideConfig()), "bounces": 1}}, "bounces is '1', expected true or false"),
         ({"guide": 3}, "guide must be an object"),
         ({"tokens": "some"}, "tokens='some' is not supported: none, lookup or encoder"),
         ({"token_dim": 25}, "token_dim=25 must be a multiple of 6 model.token_heads=6"),

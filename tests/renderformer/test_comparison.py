@@ -24,13 +24,13 @@ def test_the_papers_tables_are_no_comparisons():
 
 def test_every_rung_gives_one_thing_more_and_all_read_one_dataset():
     jobs = dict(jobs_of("priors", None, []))
-    assert len({job.keys["shard"] for job in jobs.values()}) == 1 and len({job.keys["train"] for job in jobs.values()}) == 9
+    assert len({job.keys["shard"] for job in jobs.values()}) == 1 and len({job.keys["train"] for job in jobs.values()}) == 10
     models = {name: job.plan["train"].config.model for name, job in jobs.items()}
     guides = [
-        set(k for k, on in model.guide.model_dump().items() if on) for name, model in models.items() if name[0] in "123456"
+        set(k for k, on in model.guide.model_dump().items() if on) for name, model in models.items() if name[0] in "1234567"
     ]
-    assert [len(b - a) for a, b in zip(guides, guides[1:], strict=False)] == [1] * 5 and not guides[0]
-    assert [models[name].tokens for name in ("6_lobe", "7_all_lookup", "8_all_pixels")] == ["encoder", "lookup", "none"]
+    assert [len(b - a) for a, b in zip(guides, guides[1:], strict=False)] == [1] * 6 and not guides[0]
+    assert [models[name].tokens for name in ("7_bounces", "8_all_lookup", "9_all_pixels")] == ["encoder", "lookup", "none"]
     assert not hasattr(models["0_renderformer"], "guide")
 
 
@@ -40,7 +40,7 @@ def test_the_default_is_the_single_models_on_shards_with_guides():
     jobs = dict(jobs_of("default", None, []))
     assert list(jobs) == ["guided", "renderformer"]
     (guided,) = expand(["stage=evaluate", "model=guided"])
-    (tiny,) = expand(["stage=evaluate", "shard.guides=true"])
+    (tiny,) = expand(["stage=evaluate", "shard=guided"])
     assert jobs["guided"].keys == guided.keys and jobs["renderformer"].keys == tiny.keys
 
 
@@ -63,7 +63,7 @@ def test_missing_runs_are_named_and_no_page_is_written(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["data"], "-m pipeline stage=data shard.guides=true"),
+        (["data"], "-m pipeline stage=data shard=guided"),
         (["train"], "-m stages.cli sweep default --until train"),
         (["eval", "ARGS=scene.count.train=9"], "-m stages.cli sweep default scene.count.train=9"),
         (["train", "ARGS=model=tiny"], "-m pipeline system=renderformer stage=train model=tiny"),

@@ -10,9 +10,11 @@ import pytest
 from pipeline.errors import UserError
 from stages.renderformer.dataset import BatchConfig, Batches, Needs, Sample, ShardDataset, collate, make_example, mirror, move
 from stages.renderformer.dataset.augment import rotation_from_vector, take_bundles
+from stages.renderformer.dataset.loader import choose, landed_bundles
 from stages.renderformer.guides import GuideCaster
 from stages.renderformer.guides.casting import POINTS, sample_ggx
 from stages.renderformer.guides.records import (
+    BOUNCES,
     WEIGHT_STEPS,
     check_guides,
     decode_scene_guides,
@@ -61,7 +63,7 @@ LIGHT = [np.array([[-0.02, -0.02, 2], [0.02, -0.02, 2], [0, 0.02, 2]])]
 def shards(tmp_path_factory):
     path = tmp_path_factory.mktemp("guides")
     inputs = dataset_inputs(path, train=4, test=1, size=SIDE)
-    return inputs, commit_shards(path / "store", inputs, Shard(), ShardConfig(guides=True), 4)
+    return inputs, commit_shards(path / "store", inputs, Shard(), ShardConfig(guides=True, bounces=True), 4)
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +145,28 @@ def test_sampled_facets_follow_the_visible_normals():
     np.testing.assert_allclose(drawn.mean(axis=0), (h * density[:, None]).sum(axis=0) / density.sum(), atol=5e-3)
 
 
+def test_rays_leave_both_sides_of_a_triangle_by_the_cosine():
+    """A floor under a roof that covers all directions within 60 degrees: three quarters of the cosine."""
+    ring = [np.array([np.cos(a), np.sin(a), 0]) * np.sqrt(3) for a in np.linspace(0, 2 * np.pi, 49)]
+    top = np.array([0, 0, 1.0])
+    roof = [np.array([top, top + b, top + a]) for a, b in zip(ring, ring[1:], strict=False)]
+    spots = [np.array([[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0]]) + [1e-4 * i, 0, 0] for i in range(40)]
+    guides = GuideCaster(scene_of([*spots, *roof, *LIGHT])).scene_guides()
+    up, down = guides.bounces[:40, 0], guides.bounces[:40, 1]
+    assert (up >= 40).mean() == pytest.approx(0.75, abs=0.03) and (up < 0).mean() == pytest.approx(0.25, abs=0.03)
+    assert not (down >= 40).any()
+    assert guides.bounces.shape == (40 + 48 + 1, 2, BOUNCES) and not (guides.bounces[40:88, 0] >= 0).any()  # roofs look up
+    spread = np.bincount(up[up >= 40] - 40, minlength=49)[:48]
+    np.testing.assert_allclose(spread.reshape(4, 12).sum(axis=1) / spread.sum(), 0.25, atol=0.03)
+
+
+def test_corners_at_one_place_of_one_smooth_surface_are_one_vertex():
+    wall = quad([-2, 2, 0], [2, 2, 0], [2, 2, 2], [-2, 2, 2])
+    vertex = GuideCaster(scene_of([*FLOOR, *wall, *LIGHT])).scene_guides().vertex
+    assert vertex.shape == (5, 3) and len(np.unique(vertex[:2])) == 4 and len(np.unique(vertex[:4])) == 8
+    assert vertex[0, 0] == vertex[1, 0] and vertex[0, 2] == vertex[1, 1]
+
+
 def test_more_lights_than_are_kept_one_by_one_are_refused():
     with pytest.raises(UserError, match="has 257 emitting triangles: guides take at most 256"):
         GuideCaster(scene_of([*FLOOR, *LIGHT * 257], lights=257))
@@ -160,7 +184,12 @@ def test_bytes_hold_all_but_the_last_digits_of_weights(scene):
     for name, values in vars(view).items():
         tolerance = 0.5001 / WEIGHT_STEPS if name.endswith("weights") else 0
         np.testing.assert_allclose(getattr(again, name), values, atol=tolerance, rtol=0)
-    assert all(np.array_equal(getattr(again_whole, name), values) for name, values in vars(whole).items())
+    for name, values in vars(whole).items():
+        tolerance = 0.5001 / WEIGHT_STEPS if name.endswith("weights") else 0
+        np.testing.assert_allclose(getattr(again_whole, name), values, atol=tolerance, rtol=0)
+    few = caster.scene_guides(bounces=False)
+    assert few.bounces is None and decode_scene_guides(encode_scene_guides(few), "scene").bounces is None
+    assert np.array_equal(few.light_seen, whole.light_seen)
 
 
 def test_damaged_or_foreign_guides_are_refused(scene):
@@ -171,6 +200,12 @@ def test_damaged_or_foreign_guides_are_refused(scene):
             decode_view_guides(broken, "view3.guides.npz of x")
     with pytest.raises(UserError, match="are not those of a scene of 3 triangles"):
         check_guides(3, caster.scene_guides(), [caster.view_guides(0, 8, 8)])
+    whole = caster.scene_guides()
+    count = len(scene.triangles)
+    check_guides(count, whole, [])
+    for name, value in (("bounces", whole.bounces + count), ("vertex", whole.vertex + 3 * count), ("vertex", whole.vertex - 1)):
+        with pytest.raises(UserError, match="are not those of a scene"):
+            check_guides(count, replace(whole, **{name: value}), [])
 
 
 # --- what must not matter ---------------------------------------------------------------------------------------------------
@@ -200,6 +235,20 @@ def test_guides_of_a_moved_scene_are_the_moved_guides(scene, how):
         changed = move(example, rotation_from_vector(np.array([0.4, -1.1, 0.7])), np.array([0.2, 0, -0.1]))
     else:
         changed = mirror(example)
+    row, side = np.nonzero(example["guide_bounces"].reshape(-1, 32).max(axis=1) >= 0)[0], np.s_[:, 0, :]
+    before, after = (
+        points(given, e["guide_bounces"][side], e["guide_bounces_weights"][side])[row]
+        for given, e in ((scene, example), (moved_scene(scene, changed), changed))
+    )  # what was hit moves along
+    if how == "rotated":
+        before = before @ rotation_from_vector(np.array([0.4, -1.1, 0.7])).T + np.array([0.2, 0, -0.1])
+    else:
+        before = before * [-1, 1, 1]
+    np.testing.assert_allclose(after, before, atol=1e-5)
+    corners = moved_scene(scene, changed).triangles.reshape(-1, 3)
+    first = np.full(changed["guide_vertex"].max() + 1, -1)
+    first[changed["guide_vertex"].ravel()[::-1]] = np.arange(len(corners))[::-1]
+    np.testing.assert_allclose(corners, corners[first[changed["guide_vertex"].ravel()]], atol=3e-4)
     recast = make_example(sample_of(moved_scene(scene, changed)), views, None)
     assert share_of_equal(changed, recast, "guide_hit") > 0.999
     assert share_of_equal(changed, recast, "guide_mirror") > (0.999 if how == "rotated" else 0.8)  # of another ray, if mirrored
@@ -270,6 +319,27 @@ def test_batches_hold_guides_and_only_the_drawn_bundles(shards):
                 for name in ("image", "guide_hit", "guide_mirror_weights", "guide_light_seen"):
                     expected = whole[name][window]
                     assert np.array_equal(few[name][scene, view, place], expected.reshape(64, *expected.shape[2:])), name
+
+
+def test_bundles_are_drawn_where_something_was_hit(shards):
+    rng = np.random.default_rng(0)
+    landed = np.arange(16) % 3 == 0  # six
+    for _ in range(20):
+        few, many = choose(rng, landed, 4), choose(rng, landed, 9)
+        assert landed[few].all() and len(set(few)) == 4 and (few == np.sort(few)).all()
+        assert landed[many].sum() == 6 and len(set(many)) == 9
+    assert len({tuple(choose(rng, landed, 4)) for _ in range(200)}) == 15  # any four of six
+    assert len(choose(rng, ~landed & landed, 4)) == 4
+    main = np.full((2, 16, 16), -1)
+    main[0, 7, 8], main[1, 15, 15] = 2, 0
+    example = {"guide_main": main, "views": np.arange(2)}
+    assert landed_bundles(example, 8, 4).tolist() == [[False, True, False, False], [False, False, False, True]]
+    assert landed_bundles({"views": np.arange(2)}, 8, 4).all()
+
+
+def test_bounces_without_guides_are_refused():
+    with pytest.raises(ValueError, match=r"set shard.guides=true, too"):
+        ShardConfig(bounces=True)
 
 
 def test_padding_of_lights_is_marked(scene):

@@ -12,8 +12,8 @@ from model.renderformer.config import check_types
 
 ARCHITECTURE = "guided"
 # Channels that networks of any config have
-TOKEN_FEATURES = 82  # what is known of a triangle
-PIXEL_FEATURES = 88  # of a pixel
+TOKEN_FEATURES = 82  # what is known of a triangle, besides bounces
+PIXEL_FEATURES = 88  # of a pixel, besides bounces
 LIGHT_FEATURES = 13  # of a light in a pixel
 PIXEL_DIM = 32  # of a pixel in its bundle
 LIGHT_DIM = 32  # of a pixel's light, and of a corner's token
@@ -28,9 +28,10 @@ class GuideConfig:
     lobe: bool = True  # what reflections drawn from the surface's lobe hit, in the mirror's place in the image
     visibility: bool = True  # which lights four points of each triangle see
     shadow_rays: bool = True  # which lights each pixel's hits see
+    bounces: bool = True  # what rays from both sides of every triangle hit: how triangles light one another, by radiosity
 
     def __post_init__(self) -> None:
-        needs_light = [name for name in ("mirror", "lobe", "visibility", "shadow_rays") if getattr(self, name)]
+        needs_light = [name for name in ("mirror", "lobe", "visibility", "shadow_rays", "bounces") if getattr(self, name)]
         if needs_light and not self.light:
             raise InputError(
                 f"model.guide.{needs_light[0]}=true needs model.guide.light=true: it tells where closed forms hold"
@@ -61,6 +62,16 @@ class GuidedConfig:
                 f"model.token_dim={self.token_dim} must be a multiple of 6 model.token_heads={6 * self.token_heads}: heads "
                 "turn by three coordinates, two channels an angle"
             )
+
+    @property
+    def token_features(self) -> int:
+        """Channels of what is known of a triangle."""
+        return TOKEN_FEATURES + 6 * self.guide.bounces
+
+    @property
+    def pixel_features(self) -> int:
+        """Channels of what is known of a pixel."""
+        return PIXEL_FEATURES + 3 * self.guide.bounces
 
     @property
     def depth(self) -> int:
@@ -98,9 +109,13 @@ class GuidedConfig:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any], where: str = "config") -> GuidedConfig:
-        """From a ``config.json``; every field must be there, and no other."""
+        """From a ``config.json``; every field must be there, and no other.
+
+        But ``guide.bounces``, which came later: networks that do not know it do without.
+        """
         data = {name: value for name, value in data.items() if name != "architecture"}
         guide = data.get("guide")
+        guide = {"bounces": False, **guide} if isinstance(guide, dict) else guide
         for kind, given, prefix in ((cls, data, ""), (GuideConfig, guide, "guide.")):
             names = {entry.name for entry in dataclasses.fields(kind)}
             if not isinstance(given, dict):

@@ -8,8 +8,6 @@ from model.renderformer.guided.config import (
     LIGHT_DIM,
     LIGHT_FEATURES,
     PIXEL_DIM,
-    PIXEL_FEATURES,
-    TOKEN_FEATURES,
     GuidedConfig,
 )
 
@@ -24,16 +22,16 @@ def forward_flops(
     dim, head, hidden = config.token_dim, config.head_dim, 4 * config.token_dim
     pixels = len(triangles) * views * height * width
     bundles, tokens = pixels / config.bundle**2, sum(triangles)
-    inputs = PIXEL_FEATURES
+    inputs = config.pixel_features
     parts = {}
     if config.tokens != "none":
-        parts["embedding"] = tokens * (2 * dim * (TOKEN_FEATURES + dim) + 3 * LIGHT_DIM * dim)
+        parts["embedding"] = tokens * (2 * dim * (config.token_features + dim) + 3 * LIGHT_DIM * dim)
         inputs += 2 * dim + LIGHT_DIM
     if config.tokens == "encoder":
         inputs += dim
         parts["encoder layers"] = config.token_layers * tokens * (4 * dim**2 + 3 * dim * hidden)
         parts["encoder attention"] = config.token_layers * 2 * dim * sum(n * n for n in triangles)
-        parts["rays"] = pixels * PIXEL_FEATURES * PIXEL_DIM + bundles * PIXEL_DIM * config.bundle**2 * dim
+        parts["rays"] = pixels * config.pixel_features * PIXEL_DIM + bundles * PIXEL_DIM * config.bundle**2 * dim
         parts["decoder layers"] = bundles * (2 * dim**2 + 3 * dim * hidden) + tokens * 2 * dim**2
         parts["cross-attention"] = 2 * dim * bundles / max(1, len(triangles)) * tokens
     parts["head"] = pixels * (inputs * head + config.head_layers * 6 * head**2 + head * (7 + LIGHT_DIM))

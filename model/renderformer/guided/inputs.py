@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ class Scenes:
     corners, vertex_normals: (T, 3, 3), world. diffuse, specular: (T, 3); roughness: (T,); emitters are black.
     emission: (T, 3), and radiance (B, L, 3), of the lights: over ``scale`` (B,). light_corners: (B, L, 3, 3).
     seen: (T, 4, L), which lights the triangle's points see, 0 to 1. segments: triangles of each scene.
+    bounces: (1, T 2 R) hits of the R rays that leave each triangle's front, then its back, spread by cosine; or None.
+    vertex: (T, 3), corners of one number lie at one place of one smooth surface; only with ``bounces``.
     textures: (K, 7, P, P) diffuse, specular and roughness of some triangles; texture_row: (T,), -1 for the others; or None.
     """
 
@@ -45,6 +48,8 @@ class Scenes:
     radiance: Tensor
     seen: Tensor
     segments: Segments
+    bounces: Hits | None = None
+    vertex: Tensor | None = None
     textures: Tensor | None = None
     texture_row: Tensor | None = None
 
@@ -54,18 +59,33 @@ class Scenes:
         lengths = torch.tensor([0, *self.segments.lengths[:-1]], device=self.corners.device)
         return lengths.cumsum(0)
 
+    @cached_property
+    def face_normals(self) -> Tensor:
+        """(T, 3), unit."""
+        return F.normalize(_cross(self.corners), dim=-1, eps=1e-20)
+
+    @cached_property
+    def areas(self) -> Tensor:
+        """(T,)."""
+        return _cross(self.corners).norm(dim=-1) / 2
+
     @property
     def scene_of(self) -> Tensor:
         """(T,), the scene of each triangle."""
         return self.segments.index(self.corners.device)
 
     @classmethod
-    def read(cls, batch: Mapping[str, Any], device: torch.device | str) -> Scenes:
-        """From padded numpy arrays (``stages.renderformer.dataset`` lists them); InputError where they have no guides."""
-        if "guide_light_triangles" not in batch:
-            raise InputError(
-                "a guided model reads guides, and the data has none: make the shards with shard.guides=true (model=guided does)"
-            )
+    def read(cls, batch: Mapping[str, Any], device: torch.device | str, bounces: bool = True) -> Scenes:
+        """From padded numpy arrays (``stages.renderformer.dataset`` lists them); InputError where they lack guides.
+
+        bounces: whether those are read, too.
+        """
+        for name, setting in (("light_triangles", "guides"), ("bounces", "bounces")):
+            if f"guide_{name}" not in batch and (name != "bounces" or bounces):
+                raise InputError(
+                    f"a guided model reads {setting}, and the data has none: make the shards with shard.{setting}=true "
+                    "(model=guided does)"
+                )
         mask = np.asarray(batch["mask"], bool)
 
         def put(name: str) -> Tensor:
@@ -100,10 +120,20 @@ class Scenes:
             put("guide_triangle_seen").float(),
             segments,
         )
+        if bounces:
+            scene = segments.index(corners.device)
+            scenes.bounces = _bounces(put("guide_bounces"), put("guide_bounces_weights"), first[scene])
+            scenes.vertex = put("guide_vertex").long() + 3 * first[scene][:, None]
         if batch.get("patch_index") is not None and len(batch["patches"]):
             scenes.texture_row = put("patch_index").long()
             scenes.textures = torch.from_numpy(np.asarray(batch["patches"], np.float32)).to(device)
         return scenes
+
+
+def _cross(corners: Tensor) -> Tensor:
+    """(T, 3, 3) -> (T, 3): normals, twice as long as the triangles are large."""
+    a, b, c = corners.unbind(dim=1)
+    return torch.linalg.cross(b - a, c - a)
 
 
 @dataclass
@@ -122,12 +152,15 @@ class Hits:
         weights_two = torch.from_numpy(np.ascontiguousarray(weights)).to(device).float().reshape(*rows.shape, 2)
         there = rows >= 0
         rows = torch.where(there, rows + scenes.offsets[:, None], 0)
-        first = (1 - weights_two.sum(dim=-1, keepdim=True)).clamp(min=0)
-        return cls(rows, torch.cat([first, weights_two], dim=-1), there[..., None].float())
+        return cls(rows, all_weights(weights_two), there[..., None].float())
 
-    def interpolate(self, values: Tensor) -> Tensor:
-        """(T, 3, C) of corners -> (B, M, C)."""
-        return weighted(values[self.triangle], self.weights)
+    def interpolate(self, values: Tensor, rows: Tensor | None = None) -> Tensor:
+        """(T, 3, C) of corners -> (B, M, C). rows: (B, M) into ``values``, where they are not one for each triangle."""
+        return weighted(values[self.triangle if rows is None else rows], self.weights)
+
+    def sides(self, scenes: Scenes, to_eye: Tensor) -> Tensor:
+        """(B, M): 2 t where triangle t is seen from its front, 2 t + 1 from its back. to_eye: (B, M, 3)."""
+        return 2 * self.triangle + (dot(to_eye, scenes.face_normals[self.triangle]) < 0).long()
 
     def between_points(self, values: Tensor, rows: Tensor | None = None) -> Tensor:
         """(T, 4, C), of the triangles' ``POINTS`` -> (B, M, C): linear within each triangle of two corners and the centroid.
@@ -137,6 +170,18 @@ class Hits:
         least = self.weights.min(dim=-1, keepdim=True).values
         shares = torch.cat([self.weights - least, 3 * least], dim=-1)
         return weighted(values[self.triangle if rows is None else rows], shares)
+
+
+def all_weights(two: Tensor) -> Tensor:
+    """(..., 2) barycentric weights of the second and third corner -> (..., 3)."""
+    return torch.cat([(1 - two.sum(dim=-1, keepdim=True)).clamp(min=0), two], dim=-1)
+
+
+def _bounces(triangle: Tensor, weights: Tensor, first: Tensor) -> Hits:
+    """(T, 2, R) rows within each triangle's scene, (T, 2, R, 2) weights, (T,) the scene's first row."""
+    there = (triangle >= 0).reshape(1, -1, 1)
+    rows = torch.where(triangle >= 0, triangle.long() + first[:, None, None], 0)
+    return Hits(rows.reshape(1, -1), all_weights(weights.reshape(1, -1, 2)), there.float())
 
 
 def weighted(values: Tensor, weights: Tensor) -> Tensor:

@@ -11,7 +11,8 @@ A batch holds, for B scenes padded to N triangles with V views of H x W pixels (
     patch_index (B, N) int32, -1 = constant, else into patches (T, 7, 32, 32) float16 of this batch: both only where
     a scene of the batch has textured triangles;
     guide_* where they were asked for (``stages.renderformer.guides.records``): guide_light_triangles (B, L), -1 where a scene
-    has fewer; guide_triangle_seen (B, N, 4, L); guide_hit (B, V, H, W, 4) and the other fields of ViewGuides;
+    has fewer; guide_triangle_seen (B, N, 4, L); guide_bounces (B, N, 2, 16), guide_bounces_weights and guide_vertex, where
+    the shards have bounces; guide_hit (B, V, H, W, 4) and the other fields of ViewGuides;
     bundles (B, V, K) int64 where only some ray bundles were drawn: image and guides are then (B, V, K, side^2, ...);
     views (B, V) int64, camera index of each view; ids, B sample ids; damaged, (id, reason) of samples that were skipped.
 """

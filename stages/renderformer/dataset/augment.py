@@ -19,7 +19,6 @@ from pipeline.errors import UserError
 from stages.graphics.exr import copy_pixels
 from stages.renderformer.dataset.shards import Sample
 from stages.renderformer.guides import SceneGuides, ViewGuides
-from stages.renderformer.guides.records import mirrored_seen
 from stages.renderformer.records import SceneRecord
 from stages.renderformer.views import LAYERS
 
@@ -31,8 +30,9 @@ PIXELS = ("image", *LAYERS)  # (V, H, W) or (V, H, W, 3)
 PATCHES = tuple(SceneRecord.PATCH_DTYPES)  # only in examples with textured triangles
 GUIDE = "guide_"  # begins the names of guides (``stages.renderformer.guides``), only in examples that were read with them
 LIGHT_TRIANGLES, TRIANGLE_SEEN = f"{GUIDE}light_triangles", f"{GUIDE}triangle_seen"
+BOUNCES = tuple(f"{GUIDE}{name}" for name in ("bounces", "bounces_weights", "vertex"))
 PIXEL_GUIDES = tuple(f"{GUIDE}{field.name}" for field in dataclasses.fields(ViewGuides))
-LIGHTS_PADDED = (LIGHT_TRIANGLES, TRIANGLE_SEEN, f"{GUIDE}light_seen")  # their last axis counts a scene's emitting triangles
+PADDED = (LIGHT_TRIANGLES, TRIANGLE_SEEN, f"{GUIDE}light_seen", *BOUNCES)  # an axis counts a scene's triangles or its lamps
 
 
 class Relight(Section):
@@ -86,8 +86,10 @@ def make_example(sample: Sample, views: np.ndarray, factors: np.ndarray | None, 
 
 
 def scene_arrays(guides: SceneGuides) -> Batch:
-    """``guide_light_triangles`` (L,), ``guide_triangle_seen`` (N, 4, L)."""
-    return {LIGHT_TRIANGLES: guides.light_triangles, TRIANGLE_SEEN: guides.light_seen}
+    """``guide_light_triangles`` (L,), ``guide_triangle_seen`` (N, 4, L), and what else `SceneGuides` has after ``guide_``."""
+    bounces = (guides.bounces, guides.bounces_weights, guides.vertex)
+    arrays = {LIGHT_TRIANGLES: guides.light_triangles, TRIANGLE_SEEN: guides.light_seen}
+    return arrays | ({} if guides.bounces is None else dict(zip(BOUNCES, bounces, strict=True)))
 
 
 def view_arrays(views: Sequence[ViewGuides]) -> Batch:
@@ -200,8 +202,8 @@ def _mirrored_guides(example: Batch) -> Batch:
     fields = [field.name for field in dataclasses.fields(ViewGuides)]
     views = zip(*(example[f"{GUIDE}{name}"] for name in fields), strict=True)
     mirrored = [ViewGuides(*view).mirrored() for view in views]
-    scene = SceneGuides(example[LIGHT_TRIANGLES], mirrored_seen(example[TRIANGLE_SEEN]))
-    return scene_arrays(scene) | view_arrays(mirrored)
+    scene = SceneGuides(*(example.get(name) for name in (LIGHT_TRIANGLES, TRIANGLE_SEEN, *BOUNCES)))
+    return scene_arrays(scene.mirrored()) | view_arrays(mirrored)
 
 
 def planes(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
@@ -212,7 +214,7 @@ def planes(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def collate(examples: Iterable[Batch], count: int) -> Batch:
-    """``count`` examples stacked; triangles padded with zeros to the longest, lights of guides with -1.
+    """``count`` examples stacked; triangles padded with zeros to the longest, rows of guides with -1.
 
     A generator is asked for one example after the other, whose pixels are copied and let go before the next one's are decoded:
     memory used again at once costs far less than fresh memory.
@@ -247,9 +249,9 @@ def collate(examples: Iterable[Batch], count: int) -> Batch:
             batch[name] = np.zeros((count, longest, *arrays[0].shape[1:]), arrays[0].dtype)
             for row, array in zip(batch[name], arrays, strict=True):
                 row[: len(array)] = array
-        elif name in LIGHTS_PADDED:
+        elif name in PADDED:
             shape = np.max([array.shape for array in arrays], axis=0)
-            batch[name] = np.full((count, *shape), -1 if name == LIGHT_TRIANGLES else 0, arrays[0].dtype)
+            batch[name] = np.full((count, *shape), -1 if name in (LIGHT_TRIANGLES, BOUNCES[0]) else 0, arrays[0].dtype)
             for row, array in zip(batch[name], arrays, strict=True):
                 row[tuple(slice(0, size) for size in array.shape)] = array
         else:

@@ -81,6 +81,9 @@ GUIDE_MEMBERS = (
     ("guides.npz", "light_triangles", "(E,)", "int32", "rows of faces that emit"),
     ("guides.npz", "light_seen", "(F, 4, E)", "bits", "whether a point of the triangle sees a point of the light; points 0 to "
      "2 have weight 2/3 of their corner and 1/6 of the others, point 3 is the centroid; packed along the last axis"),
+    ("guides.npz", "bounces", "(F, 2, 16)", "uint16/32", "with shard.bounces: row of faces + 1 that rays hit which leave the "
+    "front and the back of each, spread by cosine, 0 for nothing; bounces_weights as below"),
+    ("guides.npz", "vertex", "(F, 3)", "int32", "with shard.bounces: corners of one number are one vertex of a smooth surface"),
     ("view<i>.guides.npz", "hit", "(H, W, 4)", "uint16/32", "row of faces + 1 that the pixel's rays hit, 2 x 2 row by row, "
      "0 = nothing; camera rays pass through lights"),
     ("view<i>.guides.npz", "main", "(H, W)", "int8", "0..3, the first of these rays that hits something, -1 where none does"),

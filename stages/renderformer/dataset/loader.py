@@ -22,6 +22,7 @@ from pipeline.config import Section, added
 from pipeline.errors import UserError
 from pipeline.keys import seed_for
 from stages.renderformer.dataset.augment import (
+    GUIDE,
     Batch,
     Relight,
     collate,
@@ -174,9 +175,26 @@ class Batches:
         if config.bundles_per_view:
             total = (self.dataset.resolution // self.needs.bundle) ** 2
             count = min(config.bundles_per_view, total)
-            chosen = np.stack([np.sort(rng.choice(total, count, replace=False)) for _ in views])
+            chosen = np.stack([choose(rng, landed, count) for landed in landed_bundles(example, self.needs.bundle, total)])
             example = take_bundles(example, chosen, self.needs.bundle)
         return example
+
+
+def landed_bundles(example: Batch, side: int, total: int) -> np.ndarray:
+    """(V, K = ``total``) bool: which of a view's bundles of side x side pixels hit anything; all, where there are no guides."""
+    main = example.get(f"{GUIDE}main")
+    if main is None:
+        return np.ones((len(example["views"]), total), bool)
+    views, height, width = main.shape
+    return (main >= 0).reshape(views, height // side, side, width // side, side).any(axis=(2, 4)).reshape(views, total)
+
+
+def choose(rng: np.random.Generator, landed: np.ndarray, count: int) -> np.ndarray:
+    """(count,) sorted numbers of bundles: of those that hit something, as far as they go. The others are black, whatever a
+    network says, so they teach nothing."""
+    there = rng.permutation(np.flatnonzero(landed))[:count]
+    others = rng.permutation(np.flatnonzero(~landed))[: count - len(there)]
+    return np.sort(np.concatenate([there, others]))
 
 
 def evaluation_samples(dataset: ShardDataset, guides: bool = False) -> Iterator[Batch]:

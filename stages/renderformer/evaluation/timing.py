@@ -86,22 +86,21 @@ def guided_seconds(model: Any, scene: SceneRecord, view: int, resolution: int, d
     """Rays are cast on one thread of the CPU, whatever the device."""
     import torch
 
-    from model.renderformer.guided.inputs import Scenes
-    from model.renderformer.guided.network import Pixels
+    from model.renderformer.guided.pixels import Pixels
     from model.timing import fastest
     from stages.renderformer.dataset.augment import scene_arrays, view_arrays
     from stages.renderformer.guides import GuideCaster
     from stages.renderformer.inference.predict import batched, camera_arrays, padded_arrays
 
     caster = GuideCaster(scene)
-    batch = padded_arrays(scene) | batched(scene_arrays(caster.scene_guides()))
+    batch = padded_arrays(scene) | batched(scene_arrays(caster.scene_guides(model.reads_bounces)))
     cast = caster.view_guides(view, resolution, resolution)
     with torch.inference_mode():
-        scenes = Scenes.read(batch, device)
+        scenes = model.read_scenes(batch, device)
         encoded = model.encode(scenes)
         pixels = Pixels.read(camera_arrays(scene, view) | batched(view_arrays([cast])), scenes, model.config.bundle)
         return {
-            "cast_scene": fastest(lambda: GuideCaster(scene).scene_guides(), "cpu", repeats),
+            "cast_scene": fastest(lambda: GuideCaster(scene).scene_guides(model.reads_bounces), "cpu", repeats),
             "guided_encode": fastest(lambda: model.encode(scenes), device, repeats),
             "cast_view": fastest(lambda: caster.view_guides(view, resolution, resolution), "cpu", repeats),
             "guided_decode": fastest(lambda: model.decode_view(encoded, pixels), device, repeats),

@@ -12,13 +12,14 @@ import numpy as np
 from pipeline.errors import UserError
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster
-from stages.renderformer.guides.records import SUBSAMPLES, SceneGuides, ViewGuides
+from stages.renderformer.guides.records import BOUNCES, SUBSAMPLES, SceneGuides, ViewGuides
 from stages.renderformer.records import SceneRecord
 
 # Barycentric weights (4, 3): the centroids of the four triangles that a triangle's edge midpoints cut it into.
 POINTS = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 2]]) / 6
 OFFSET = 1e-4  # scene units between a surface and a ray that leaves it
 SHORTER = 1 - 1e-3  # of a segment to a light, so that it does not end in it
+SAME = (1e-4, 1e-2)  # scene units, and of unit normals: nearer corners are one vertex
 MIN_ALPHA = 1e-4  # GGX width below which the lobe is numerically a mirror
 MOST_LIGHTS = 256  # emitting triangles whose visibility is kept one by one
 
@@ -44,8 +45,8 @@ class GuideCaster:
         self._all = Caster(corners.reshape(-1, 3), faces)
         self._visible = Caster(corners.reshape(-1, 3), faces[self._rows], self._all.origin)
 
-    def scene_guides(self) -> SceneGuides:
-        """Which lights each of the triangles' points sees, from the side that faces the light."""
+    def scene_guides(self, bounces: bool = True) -> SceneGuides:
+        """Which lights each of the triangles' points sees, from the side that faces the light; with ``bounces`` what else."""
         points = np.einsum("kc,ncd->nkd", POINTS, self._corners)
         count, lights = len(points), len(self.light_triangles)
         seen = np.zeros((count, SUBSAMPLES, lights), bool)
@@ -55,7 +56,40 @@ class GuideCaster:
             free = self._free(triangle[::SUBSAMPLES, None], points[:, None, point], targets)
             seen[:, point] = free
         seen[self.light_triangles[:, None], :, np.arange(lights)] = False  # a light does not light itself
-        return SceneGuides(self.light_triangles, seen)
+        if not bounces:
+            return SceneGuides(self.light_triangles, seen)
+        return SceneGuides(self.light_triangles, seen, *self._bounces(), self._vertices())
+
+    def _bounces(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 2, 16) and (N, 2, 16, 2): what rays hit that leave points all over each triangle, from its front and its back.
+
+        They are stratified over the disc that the hemisphere projects to. The numbers depend on the triangle's row alone.
+        """
+        count, side = len(self._corners), int(np.sqrt(BOUNCES))
+        shape = (count, 2, BOUNCES)
+        random = np.random.default_rng(0).random((*shape, 4))
+        strata = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(BOUNCES, 2)
+        height, turn = np.moveaxis((strata + random[..., :2]) / side, -1, 0).reshape(2, -1)
+        root, along = np.sqrt(random[..., 2]).ravel(), random[..., 3].ravel()
+        triangle = np.repeat(np.arange(count), 2 * BOUNCES)
+        weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
+        start = (self._corners[triangle] * weights[:, :, None]).sum(axis=1)
+        up = frames((self._normals[:, None] * np.array([[1.0], [-1.0]])).reshape(-1, 3)).repeat(BOUNCES, axis=0)
+        radius, angle = np.sqrt(height), 2 * np.pi * turn
+        ways = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - height)], axis=1)
+        ways = np.einsum("nij,ni->nj", up, ways)
+        starts, _ = self._leave(triangle, start, ways)
+        hit, hit_weights, _ = self._all.cast(starts, ways)
+        return hit.reshape(shape), hit_weights.reshape(*shape, 2)
+
+    def _vertices(self) -> np.ndarray:
+        """(N, 3): corners that lie at one place and have one shading normal, to `SAME`, have one number."""
+        corners = self.scene.triangles.reshape(-1, 3).astype(float)
+        normals = self.scene.vertex_normals.reshape(-1, 3).astype(float)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        keys = np.round(np.concatenate([corners / SAME[0], normals / SAME[1]], axis=1)).astype(np.int64)
+        _, number = np.unique(keys, axis=0, return_inverse=True)
+        return number.reshape(-1, 3).astype(np.int32)
 
     def view_guides(self, view: int, height: int, width: int) -> ViewGuides:
         """What camera ``view`` of the scene sees; its fov is the angle across the height."""

@@ -20,6 +20,7 @@ from pipeline.errors import UserError
 SUBSAMPLES = 4  # rays of a pixel, 2 x 2, row by row
 MIRRORED = (1, 0, 3, 2)  # the sub-samples of a pixel whose image is flipped left to right
 WEIGHT_STEPS = 255  # of a stored barycentric weight
+BOUNCES = 16  # rays from each side of a triangle, a square number
 SCENE_MEMBER = "guides.npz"
 
 
@@ -35,10 +36,26 @@ class SceneGuides:
     light_triangles: (L,) int32, rows of the scene's triangles.
     light_seen: (N, 4, L) bool, whether a point of the triangle sees a point of the light. Points 0 to 2 lie near the corners,
         point 3 at the centroid (``casting.POINTS``).
+
+    With ``bounces``, else None:
+    bounces: (N, 2, 16) int32, what rays hit that leave the triangle's front and back, spread by the cosine to its normal; -1
+        for nothing. bounces_weights: (N, 2, 16, 2) float32, barycentric, of the second and the third corner.
+    vertex: (N, 3) int32 under 3 N; corners of one number lie at one place of one smooth surface.
     """
 
     light_triangles: np.ndarray
     light_seen: np.ndarray
+    bounces: np.ndarray | None = None
+    bounces_weights: np.ndarray | None = None
+    vertex: np.ndarray | None = None
+
+    def mirrored(self) -> SceneGuides:
+        """Of the mirrored scene, with the second and third corner of triangles swapped."""
+        light_seen = self.light_seen[:, [0, 2, 1, 3]]
+        if self.bounces is None:
+            return SceneGuides(self.light_triangles, light_seen)
+        weights = np.ascontiguousarray(self.bounces_weights[..., ::-1])
+        return SceneGuides(self.light_triangles, light_seen, self.bounces, weights, self.vertex[:, [0, 2, 1]])
 
 
 @dataclass
@@ -78,6 +95,11 @@ def check_guides(triangles: int, scene: SceneGuides, views: Iterable[ViewGuides]
     lights = scene.light_triangles
     fits = scene.light_seen.shape == (triangles, SUBSAMPLES, len(lights))
     fits = fits and (not len(lights) or 0 <= lights.min() <= lights.max() < triangles)
+    if scene.bounces is not None:
+        fits = fits and scene.bounces.shape[:2] == (triangles, 2) and scene.vertex.shape == (triangles, 3)
+        fits = fits and scene.bounces_weights.shape == (*scene.bounces.shape, 2)
+        fits = fits and scene.bounces.max(initial=-1) < triangles
+        fits = fits and 0 <= scene.vertex.min(initial=0) <= scene.vertex.max(initial=0) < max(3 * triangles, 1)
     for view in views:
         fits = fits and view.light_seen.shape[-1] == len(lights) and view.main.max(initial=-1) < SUBSAMPLES
         fits = fits and all(kind.max(initial=-1) < triangles for kind in (view.hit, view.mirror, view.lobe))
@@ -85,31 +107,31 @@ def check_guides(triangles: int, scene: SceneGuides, views: Iterable[ViewGuides]
         raise UserError(f"the guides are not those of a scene of {triangles} triangles: make the shards again")
 
 
-def mirrored_seen(light_seen: np.ndarray) -> np.ndarray:
-    """(N, 4, L) of `SceneGuides` in the mirrored scene."""
-    return light_seen[:, [0, 2, 1, 3]]
-
-
 # --- bytes ----------------------------------------------------------------------------------------------------------------
 
 
 def encode_scene_guides(guides: SceneGuides) -> bytes:
-    return _pack({"light_triangles": guides.light_triangles.astype(np.int32), "light_seen": _bits(guides.light_seen)})
+    arrays = {"light_triangles": guides.light_triangles.astype(np.int32), "light_seen": _bits(guides.light_seen)}
+    if guides.bounces is not None:
+        arrays |= _hits("bounces", guides.bounces, guides.bounces_weights, _row_kind(guides.bounces))
+        arrays["vertex"] = guides.vertex.astype(np.int32)
+    return _pack(arrays)
 
 
 def decode_scene_guides(data: bytes, where: str) -> SceneGuides:
-    arrays = _unpack(data, where, ("light_triangles", "light_seen"))
-    lights = len(arrays["light_triangles"])
-    return SceneGuides(arrays["light_triangles"], _from_bits(arrays["light_seen"], lights, where))
+    arrays = _unpack(data, where, ("light_triangles", "light_seen"), ("bounces", "bounces_weights", "vertex"))
+    arrays["light_seen"] = _from_bits(arrays["light_seen"], len(arrays["light_triangles"]), where)
+    if "bounces" in arrays:
+        _as_hits(arrays, "bounces")
+    return SceneGuides(**arrays)
 
 
 def encode_view_guides(guides: ViewGuides) -> bytes:
     arrays = {"light_seen": _bits(guides.light_seen), "lights": np.int32(guides.light_seen.shape[-1])}
     arrays["main"] = guides.main.astype(np.int8)
-    kind = np.uint16 if max(guides.hit.max(), guides.mirror.max(), guides.lobe.max()) < 65535 else np.uint32
+    kind = _row_kind(guides.hit, guides.mirror, guides.lobe)
     for name in ("hit", "mirror", "lobe"):
-        arrays[name] = (getattr(guides, name) + 1).astype(kind)
-        arrays[f"{name}_weights"] = np.round(getattr(guides, f"{name}_weights") * WEIGHT_STEPS).astype(np.uint8)
+        arrays |= _hits(name, getattr(guides, name), getattr(guides, f"{name}_weights"), kind)
     return _pack(arrays)
 
 
@@ -118,9 +140,23 @@ def decode_view_guides(data: bytes, where: str) -> ViewGuides:
     arrays["main"] = arrays["main"].astype(np.int32)
     arrays["light_seen"] = _from_bits(arrays["light_seen"], int(arrays.pop("lights")), where)
     for name in ("hit", "mirror", "lobe"):
-        arrays[name] = arrays[name].astype(np.int32) - 1
-        arrays[f"{name}_weights"] = arrays[f"{name}_weights"].astype(np.float32) / np.float32(WEIGHT_STEPS)
+        _as_hits(arrays, name)
     return ViewGuides(**arrays)
+
+
+def _row_kind(*rows: np.ndarray) -> type:
+    """The smallest integers that hold such rows plus one."""
+    return np.uint16 if max(kind.max(initial=-1) for kind in rows) < 65535 else np.uint32
+
+
+def _hits(name: str, rows: np.ndarray, weights: np.ndarray, kind: type) -> dict[str, np.ndarray]:
+    return {name: (rows + 1).astype(kind), f"{name}_weights": np.round(weights * WEIGHT_STEPS).astype(np.uint8)}
+
+
+def _as_hits(arrays: dict[str, Any], name: str) -> None:
+    """Turn what `_hits` made back, in place."""
+    arrays[name] = arrays[name].astype(np.int32) - 1
+    arrays[f"{name}_weights"] = arrays[f"{name}_weights"].astype(np.float32) / np.float32(WEIGHT_STEPS)
 
 
 def _bits(seen: np.ndarray) -> np.ndarray:
@@ -140,9 +176,10 @@ def _pack(arrays: Mapping[str, np.ndarray]) -> bytes:
     return buffer.getvalue()
 
 
-def _unpack(data: bytes, where: str, names: tuple[str, ...]) -> dict[str, Any]:
+def _unpack(data: bytes, where: str, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, Any]:
+    """optional: names that are there all or none."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            return {name: file[name] for name in names}
+            return {name: file[name] for name in (*names, *(optional if set(optional) & set(file.files) else ()))}
     except (KeyError, ValueError, OSError, EOFError, MemoryError, zipfile.BadZipFile, zipfile.zlib.error) as error:
         raise UserError(f"{where} cannot be decoded ({type(error).__name__}: {error})") from error

@@ -46,7 +46,7 @@ def network_arrays(
 ) -> tuple[dict[str, np.ndarray], Callable[[int], dict[str, np.ndarray]]]:
     """What the network reads: the scene as a batch of one; of each camera what that has besides. size: height, width."""
     caster = GuideCaster(scene) if model.reads_guides else None
-    batch = padded_arrays(scene) | ({} if caster is None else batched(scene_arrays(caster.scene_guides())))
+    batch = padded_arrays(scene) | ({} if caster is None else batched(scene_arrays(caster.scene_guides(model.reads_bounces))))
 
     def seen_by(view: int) -> dict[str, np.ndarray]:
         guides = {} if caster is None else batched(view_arrays([caster.view_guides(view, *size)]))
