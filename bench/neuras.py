@@ -1,9 +1,9 @@
 """What fitting, baking and drawing a scene cost, part by part.
 
-``python bench/neuras.py --store STORE [KEY] [--only step,adam,reach,gbuffer,bake,draw,page] [--three FOLDER]`` takes a bake
-artifact of neuras (default: the newest); prints a table per part. Every part takes a minute or a few. ``--three``: the unpacked
-npm package three (``npm pack three``), to draw the same mesh by three.js. Times mean little where others use the machine;
-ratios mean more.
+``python bench/neuras.py --store STORE [KEY] [--only step,adam,reach,gbuffer,bake,draw,page,stream] [--three FOLDER]`` takes
+a bake artifact of neuras (default: the newest); prints a table per part. Every part takes a minute or a few. ``--three``: the
+unpacked npm package three (``npm pack three``), to draw the same mesh by three.js. Times mean little where others use the
+machine; ratios mean more.
 
 step      seconds per million fitted pixels, memory, and the share of each part of a step
 adam      a step's update against dense Adam, and its gather against plain indexing
@@ -12,6 +12,7 @@ gbuffer   rays a second that find what each pixel sees
 bake      seconds to write the site
 draw      frame time by resolution and number of skyboxes, by OpenGL without a window, beside a plain textured mesh
 page      the same of the page in a browser without a window
+stream    memory on the device and files fetched on a drive through the scene in tiles, and through it five times in a row
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 import torch
 
+from bench import streaming
 from model.neuras import fitting, sampling
 from model.neuras.maps import Maps
 from model.neuras.rays import Pixels
@@ -60,6 +62,7 @@ from stages.neuras.records import fitted_poses, frames, posed
 
 SIZES = "640x360,1280x720,1920x1080"
 LAYERS = (1, 3, 6)
+TILE_M, REACH_M, COPIES, STOPS = 50.0, 200.0, 5, 21  # of part stream: stops are frames of the drive through one copy
 CHECKS = 15  # validations on the way, of part reach
 Row = Sequence[Any]
 
@@ -258,6 +261,48 @@ class Bench:
             rows.insert(1, ("plain textured mesh by three.js", [self.by_three(one.camera) for one in shown]))
         return _sized("milliseconds a frame, browser", self.sizes, rows)
 
+    def stream(self) -> tuple[Row, list[Row]]:
+        drive = [view for view in self.views if view.split != "shift"]
+        stops = [drive[i] for i in np.linspace(0, len(drive) - 1, min(STOPS, len(drive))).round().astype(int)]
+        metre, rows = self.scene.info.metre, []
+        for copies in (1, COPIES):
+            scene, shown = streaming.placed(self.scene, stops, copies)
+            with tempfile.TemporaryDirectory() as name:
+                folder = Path(name)
+                streaming.write(folder, scene, shown, TILE_M * metre, REACH_M * metre)
+                tiles = json.loads((folder / "scene.json").read_bytes())["tiles"]
+                files = [path.stat().st_size for path in (folder / "tiles").rglob("*") if path.is_file()]
+                places = streaming.drive(folder, len(shown))
+            length = copies * np.linalg.norm(stops[-1].camera.position - stops[0].camera.position) / metre
+            whole = sum(sum(tile["rows"]) for tile in tiles["each"]) / (tiles["columns"] * tiles["height"])
+            most = {key: max(place[key] for place in places) for key in places[0]}
+            drawn, last = max(len(place["drawn"]) for place in places), places[-1]
+            rows.append(
+                (
+                    f"{length:.0f} m",
+                    f"{whole * most['pool'] / 1e6:.1f}",
+                    *(f"{most[key] / 1e6:.1f}" for key in ("pool", "buffers")),
+                    f"{100 * most['used']:.0f} %",
+                    most["lacking"],
+                    drawn,
+                    f"{last['fetches']} of {len(files)}",
+                    f"{last['fetched'] / 1e6:.1f} of {sum(files) / 1e6:.1f}",
+                    f"{places[0]['fetched'] / 1e6:.1f}",
+                )
+            )
+        heads = (
+            "all textures, MB",
+            "pool, MB",
+            "mesh, MB",
+            "pool used",
+            "without room",
+            "tiles drawn",
+            "files",
+            "MB fetched",
+            "at the start",
+        )
+        return ("road", *heads), rows
+
     def by_three(self, camera: Any) -> float:
         """Milliseconds of a frame by three.js: the mesh with one texture as large as ours, from this camera."""
         from PIL import Image
@@ -375,7 +420,7 @@ def _sized(what: str, sizes: Sequence[tuple[int, int]], rows: Sequence[tuple[str
     return (what, *itertools.chain.from_iterable((head, "ratio") for head in heads)), cells
 
 
-PARTS = ("step", "adam", "reach", "gbuffer", "bake", "draw", "page")
+PARTS = ("step", "adam", "reach", "gbuffer", "bake", "draw", "page", "stream")
 
 
 def main() -> None:

@@ -13,10 +13,10 @@ from stages.neuras.records import AtlasMesh, Mesh
 from stages.neuras.surfaces import unfold
 
 
-def atlas(subdivisions: int = 2, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> AtlasMesh:
+def atlas(subdivisions: int = 2, centre: tuple[float, float, float] = (0.0, 0.0, 0.0), density: float = 12.0) -> AtlasMesh:
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=2.0)
     mesh = Mesh(np.asarray(ball.vertices + centre, np.float32), np.asarray(ball.faces, np.int32))
-    return unfold.pack([unfold.unfold(mesh, np.arange(len(mesh.faces)), 12.0, 2)], 2)
+    return unfold.pack([unfold.unfold(mesh, np.arange(len(mesh.faces)), density, 2)], 2)
 
 
 def baked(

@@ -15,6 +15,9 @@ import numpy as np
 from stages.graphics import browser
 
 READY = "document.documentElement?.dataset.ready ?? ''"
+SETTLED = (
+    "!lightmill.scene.tiles || Boolean(lightmill.tiles?.settled())"  # all that this view needs of a scene in tiles is there
+)
 TIMES = """(() => {
   const { gl } = lightmill, times = [];
   for (let i = 0; i < COUNT; i++) {
@@ -37,6 +40,7 @@ def pictures(site: Path, links: Sequence[str], timing: int = 0, wait_s: float = 
         images = []
         for link in links:
             page.value(f"lightmill.follow({json.dumps('#still=1&' + link)})")
+            page.until(SETTLED)
             images.append(page.canvas())
         return images, page.value(TIMES.replace("COUNT", str(timing)))
 

@@ -94,11 +94,15 @@ def textures(channels: int) -> int:
     return -(-channels // 4)
 
 
-def mesh_shaders(baked: Baked, dialect: str, ranges: Ranges | None) -> tuple[str, str]:
-    """Vertex and fragment shader of the mesh. ``ranges``: None where textures hold features themselves (half floats)."""
-    count = textures(baked.channels)
+def mesh_shaders(baked: Baked, dialect: str, ranges: Ranges | None, tiled: bool = False) -> tuple[str, str]:
+    """Vertex and fragment shader of the mesh. ``ranges``: None where textures hold features themselves (half floats).
+    ``tiled``: textures are a pool of tiles' images, and a table says where in it a chart's levels lie (``_in_pool``)."""
+    count, pyramid = textures(baked.channels), baked.pyramid
     samplers = "".join(f"uniform sampler2D mesh{i};\n" for i in range(count))
-    features = "".join(f"    vec4 f{i} = {_texel(_levels(baked.pyramid, f'mesh{i}'), ranges, i)};\n" for i in range(count))
+    features = "".join(f"    vec4 f{i} = {_texel(_levels(pyramid, f'mesh{i}', tiled), ranges, i)};\n" for i in range(count))
+    chart, texel = "chart_number", "place * texture_size"
+    if tiled:
+        chart, texel = "float(where(0, 0).w)", "in_sheet(place, where(0, 0).z) * vec2(textureSize(codes, 0))"
     body = f"""
 in vec2 place;
 in vec3 ray;
@@ -108,17 +112,17 @@ uniform int mode;
 uniform vec3 pixel_right;  // from one pixel to the next at distance 1: the camera's right over its focal length in pixels
 uniform vec3 pixel_down;
 uniform usampler2D codes;
-{samplers}{COLOURS}{_pyramid(baked.pyramid)}
+{samplers}{COLOURS}{_pyramid(pyramid, tiled)}
 {_network("mesh_colour", baked.mesh_mlp, count, baked.channels, baked.view_dependent)}
 void main() {{
     if (mode == 2) discard;
     if (mode == 3) {{ colour = vec4(1.0); return; }}
-    if (mode == 4) {{ colour = vec4(number_colour(chart_number), 1.0); return; }}
+    if (mode == 4) {{ colour = vec4(number_colour({chart}), 1.0); return; }}
     if (mode == 5) {{
-        colour = vec4(number_colour(float(texelFetch(codes, ivec2(place * texture_size), 0).r)), 1.0);
+        colour = vec4(number_colour(float(texelFetch(codes, ivec2({texel}), 0).r)), 1.0);
         return;
     }}
-{_footprint(baked.pyramid)}{features}    colour = vec4(clamp(mesh_colour({_features(count)}, normalize(ray)), 0.0, 1.0), 1.0);
+{_footprint(pyramid, tiled)}{features}    colour = vec4(clamp(mesh_colour({_features(count)}, normalize(ray)), 0.0, 1.0), 1.0);
 }}
 """
     return DIALECTS[dialect] + MESH_VERTEX, DIALECTS[dialect] + body
@@ -192,24 +196,17 @@ void main() {{
     return DIALECTS[dialect] + SKY_VERTEX, DIALECTS[dialect] + body
 
 
-def _pyramid(pyramid: Pyramid) -> str:
-    """Constants and functions that look up the mesh's sheet; ``footprints.footprint`` and ``Pyramid.sample`` in GLSL.
+def _pyramid(pyramid: Pyramid, tiled: bool) -> str:
+    """Constants and functions that look up the mesh's levels; ``footprints.footprint`` and ``Pyramid.sample`` in GLSL.
 
     ``dFdx`` and ``dFdy`` are differences from pixel to pixel, but all of them lie on the plane of one face. There texture
     coordinates are linear, so any step on the plane has its texture coordinates from two such differences, exactly.
     """
-    height, width = pyramid.sheet
-    corners = ", ".join(f"vec2({column}.0, {row}.0)" for row, column in map(pyramid.corner, range(pyramid.levels)))
     text = f"const vec2 texture_size = vec2({pyramid.width}.0, {pyramid.height}.0);\n"
     if pyramid.levels == 1:
-        return text
-    return f"""{text}const vec2 sheet_size = vec2({width}.0, {height}.0);
-const vec2 corners[{pyramid.levels}] = vec2[{pyramid.levels}]({corners});
-vec2 in_sheet(vec2 at, int level) {{  // where a level has this place, half a texel from the level's border at least
-    vec2 size = texture_size / exp2(float(level));
-    return (corners[level] + clamp(at * size, vec2(0.5), size - 0.5)) / sheet_size;
-}}
-vec2 side(vec3 pixel) {{  // texels from one pixel to the next; pixel: that step at distance 1
+        return text + (_in_pool(pyramid) if tiled else "")
+    lookup = _in_pool(pyramid) if tiled else _in_sheet(pyramid)
+    return f"""{text}{lookup}vec2 side(vec3 pixel) {{  // texels from one pixel to the next; pixel: that step at distance 1
     vec3 x = dFdx(ray);
     vec3 y = dFdy(ray);
     vec3 normal = cross(x, y);
@@ -220,17 +217,51 @@ vec2 side(vec3 pixel) {{  // texels from one pixel to the next; pixel: that step
 """
 
 
-def _footprint(pyramid: Pyramid) -> str:
+def _in_sheet(pyramid: Pyramid) -> str:
+    """The function that finds a place in the sheet of all levels."""
+    height, width = pyramid.sheet
+    corners = ", ".join(f"vec2({column}.0, {row}.0)" for row, column in map(pyramid.corner, range(pyramid.levels)))
+    return f"""const vec2 sheet_size = vec2({width}.0, {height}.0);
+const vec2 corners[{pyramid.levels}] = vec2[{pyramid.levels}]({corners});
+vec2 in_sheet(vec2 at, int level) {{  // where a level has this place, half a texel from the level's border at least
+    vec2 size = texture_size / exp2(float(level));
+    return (corners[level] + clamp(at * size, vec2(0.5), size - 0.5)) / sheet_size;
+}}
+"""
+
+
+def _in_pool(pyramid: Pyramid) -> str:
+    """The same of a pool of tiles' images, where each chart's part of a level lies by itself (``stages.neuras.baking.tiles``).
+
+    A place in the whole level is moved by whole texels, so filters weigh texels as they do in the sheet. The two samples of a
+    very long footprint may reach beyond the texels that a tile has; they take the outermost then, not what lies beside them.
+    """
+    return f"""uniform highp isampler2D places;  // two texels for each level of each chart of a tile
+ivec4 where(int level, int row) {{  // 0: steps in x and y, the finest level there, the chart; 1: the corners of its texels
+    int number = 2 * (int(chart_number) * {pyramid.levels} + level) + row;
+    int wide = textureSize(places, 0).x;
+    return texelFetch(places, ivec2(number % wide, number / wide), 0);
+}}
+vec2 in_sheet(vec2 at, int level) {{
+    vec2 size = texture_size / exp2(float(level));
+    vec4 corners = vec4(where(level, 1));
+    return clamp(at * size + vec2(where(level, 0).xy), corners.xy + 0.5, corners.zw - 0.5) / vec2(textureSize(mesh0, 0));
+}}
+"""
+
+
+def _footprint(pyramid: Pyramid, tiled: bool) -> str:
     """Statements: where the two samples look in each of two levels, and the coarser level's share."""
     if pyramid.levels == 1:
         return ""
+    finest = "float(where(0, 0).z)" if tiled else "0.0"
     return f"""    vec2 across = side(pixel_right);
     vec2 down = side(pixel_down);
     vec2 longer = length(across) >= length(down) ? across : down;
     float long_side = max(length(longer), 1e-12);
     float wide = abs(across.x * down.y - across.y * down.x) / long_side;
     vec2 spread = 0.25 * (1.0 - wide / long_side) * longer / texture_size;
-    float detail = clamp(log2(max(max(0.5 * long_side, wide), 1e-12)), 0.0, {pyramid.levels - 1}.0);
+    float detail = clamp(log2(max(max(0.5 * long_side, wide), 1e-12)), {finest}, {pyramid.levels - 1}.0);
     int finer = min(int(detail), {pyramid.levels - 2});
     float share = detail - float(finer);
     vec2 a = in_sheet(place + spread, finer);
@@ -240,10 +271,10 @@ def _footprint(pyramid: Pyramid) -> str:
 """
 
 
-def _levels(pyramid: Pyramid, map: str) -> str:
+def _levels(pyramid: Pyramid, map: str, tiled: bool) -> str:
     """The features of the mesh."""
     if pyramid.levels == 1:
-        return f"texture({map}, place)"
+        return f"texture({map}, {'in_sheet(place, 0)' if tiled else 'place'})"
     fine, coarse = (f"texture({map}, {one}) + texture({map}, {other})" for one, other in ("ab", "cd"))
     return f"0.5 * mix({fine}, {coarse}, share)"
 

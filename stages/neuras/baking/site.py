@@ -11,15 +11,22 @@ codebooks.bin      float32: mesh codes (K, D), then sky codes (K, D)
 mesh_I.png, ...    features of scenes without quantization: bytes in RGBA, four channels each (``ranges`` in scene.json)
 shaders/           GLSL ES 3.00 for WebGL 2 and GLSL 3.30 for engines
 frames/            original photos, to compare with
+tiles/N/           of a scene cut into tiles (``stages.neuras.baking.tiles``): ``geometry.glb``, with texture coordinates of the
+                   whole texture and _CHART counted anew, and ``level_L.bin``, compressed by gzip: int32 (P, 8), where each of
+                   the P charts lies (``Tiles.table``), then rows of texels: codes, uint16, or bytes in RGBA, one map after the
+                   other. The two files of the whole mesh are stubs then: one point, one
+                   texel
 =================  ====================================================================================
 """
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import shutil
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +36,11 @@ from PIL import Image
 from model.neuras.baked import Baked
 from stages.neuras.baking.drawing import lens
 from stages.neuras.baking.shaders import MODES, Ranges, mesh_shaders, resolve_shaders, sky_shaders, textures
+from stages.neuras.baking.tiles import Tiles
 from stages.neuras.records import FRAME, AtlasMesh, CaptureInfo, FrameRecord
 
 PAGE = Path(__file__).parent / "page"
+STREAMING = "tiles.js"  # the script of a page whose scene is cut; it starts the viewer and keeps its textures filled
 
 
 def write_site(
@@ -42,31 +51,34 @@ def write_site(
     frames: Iterable[FrameRecord],
     depth_range: tuple[float, float],
     expand: str,
+    tiles: Tiles | None = None,
 ) -> dict[str, int]:
     """Write the site; returns the bytes of its kinds of files: "geometry", "textures", "shaders", "page".
 
     frames: those whose photos and cameras the page offers. depth_range: near and far plane, world units. expand: what the
-    page's loader makes of codes, "rgba8" or "fp16".
+    page's loader makes of codes, "rgba8" or "fp16". tiles: the scene as it is cut; None: in one piece.
     """
     (folder / "shaders").mkdir(parents=True, exist_ok=True)
     (folder / "frames").mkdir(exist_ok=True)
     bytes_wanted = expand == "rgba8" or not baked.quantized  # the page has no half-float files
     ranges = _ranges(baked) if bytes_wanted else {"mesh": None, "sky": None}
-    _geometry(folder / "geometry.glb", atlas, baked.sky_centre)
+    tiled = tiles is not None
+    whole = _one_texel(baked) if tiled else baked
+    _geometry(folder / "geometry.glb", _one_point() if tiled else atlas, baked.sky_centre)
     if baked.quantized:
-        _codes(folder / "mesh_codes.png", baked.mesh_indices)
+        _codes(folder / "mesh_codes.png", whole.mesh_indices)
         _codes(folder / "sky_codes.png", _in_rows(baked.sky_indices))
         books = [np.ascontiguousarray(book, np.float32) for book in (baked.mesh_codebook, baked.sky_codebook)]
         (folder / "codebooks.bin").write_bytes(b"".join(book.tobytes() for book in books))
     else:
-        for name, maps in (("mesh", baked.mesh_texture()), ("sky", _in_rows(baked.sky_textures()))):
+        for name, maps in (("mesh", whole.mesh_texture()), ("sky", _in_rows(baked.sky_textures()))):
             values = ranges[name].quantized(maps)
             for index in range(textures(baked.channels)):
                 part = np.ascontiguousarray(values[..., 4 * index : 4 * index + 4])
                 Image.fromarray(part, "RGBA").save(folder / f"{name}_{index}.png")
     for dialect in ("web", "desktop"):
         programs = {
-            "mesh": mesh_shaders(baked, dialect, ranges["mesh"]),
+            "mesh": mesh_shaders(baked, dialect, ranges["mesh"], tiled),
             "sky": sky_shaders(baked, dialect, ranges["sky"]),
             "resolve": resolve_shaders(baked, dialect),
         }
@@ -83,7 +95,7 @@ def write_site(
         "quantized": baked.quantized,
         "expand": "rgba8" if bytes_wanted else "fp16",
         "ranges": {name: None if r is None else {"low": r.low.tolist(), "span": r.span.tolist()} for name, r in ranges.items()},
-        "mesh": {"width": baked.mesh_size[1], "height": baked.mesh_size[0], "levels": baked.levels, "faces": len(atlas.faces)},
+        "mesh": {"width": whole.mesh_size[1], "height": whole.mesh_size[0], "levels": baked.levels, "faces": len(atlas.faces)},
         "skyboxes": {"count": layers, "side": side, "half_sizes": baked.sky_half_sizes.tolist()},
         "codes": {name: len(book) for name, book in (("mesh", baked.mesh_codebook), ("sky", baked.sky_codebook))}
         if baked.quantized
@@ -97,11 +109,56 @@ def write_site(
         "far": depth_range[1],
         "frames": views,
     }
+    if tiled:
+        scene["tiles"] = _tiles(folder / "tiles", baked, tiles, ranges["mesh"])
     (folder / "scene.json").write_text(json.dumps(scene, indent=1, allow_nan=False) + "\n")
     for path in sorted(PAGE.iterdir()):
-        if path.suffix in (".html", ".js", ".css"):
+        if path.suffix in (".html", ".js", ".css") and (tiled or path.name != STREAMING):
             shutil.copyfile(path, folder / path.name)
+    if tiled:
+        page = folder / "index.html"
+        page.write_text(page.read_text().replace('src="viewer.js"', f'src="{STREAMING}"'))
     return sizes(folder)
+
+
+def _tiles(folder: Path, baked: Baked, tiles: Tiles, ranges: Ranges | None) -> dict[str, Any]:
+    """Write the tiles' files; returns what the page has to know of them. Boxes are relative to the centre, as vertices are."""
+    sheet = baked.mesh_indices if baked.quantized else baked.mesh_features
+    each = []
+    for number, tile in enumerate(tiles.tiles):
+        place = folder / str(number)
+        place.mkdir(parents=True, exist_ok=True)
+        _geometry(place / "geometry.glb", tile.mesh, baked.sky_centre)
+        for level in range(baked.levels):
+            texels = tiles.image(number, level, sheet, baked.pyramid)
+            if not baked.quantized:
+                maps = ranges.quantized(texels.astype(np.float32))
+                texels = np.moveaxis(maps.reshape(*maps.shape[:2], -1, 4), 2, 0)
+            data = tiles.table(number, level).tobytes() + np.ascontiguousarray(texels).tobytes()
+            (place / f"level_{level}.bin").write_bytes(gzip.compress(data, mtime=0))
+        each.append(
+            {
+                "low": (tile.mesh.vertices.min(axis=0) - baked.sky_centre).tolist(),
+                "high": (tile.mesh.vertices.max(axis=0) - baked.sky_centre).tolist(),
+                "faces": len(tile.mesh.faces),
+                "charts": len(tile.charts),
+                "density": tile.density,
+                "rows": tiles.rows[number],
+            }
+        )
+    return {"width": tiles.width, "columns": tiles.columns, "height": tiles.height, "reach": tiles.reach, "each": each}
+
+
+def _one_texel(baked: Baked) -> Baked:
+    """The scene without its mesh's texture."""
+    if baked.quantized:
+        return replace(baked, mesh_indices=np.zeros((1, 1), np.uint16))
+    return replace(baked, mesh_features=np.zeros((1, 1, baked.channels), np.float16))
+
+
+def _one_point() -> AtlasMesh:
+    """A mesh of which nothing is seen; glTF allows none without faces."""
+    return AtlasMesh(np.zeros((1, 3)), np.zeros((1, 2)), np.zeros((1, 3), np.int32), np.zeros(1, np.int32), 1, 1)
 
 
 def _ranges(baked: Baked) -> dict[str, Ranges]:
@@ -190,10 +247,10 @@ def sizes(folder: Path) -> dict[str, int]:
     kinds = {"geometry": 0, "textures": 0, "shaders": 0, "frames": 0, "page": 0}
     for path in folder.rglob("*"):
         if path.is_file():
-            kind = path.parent.name if path.parent != folder else "page"
+            kind = path.relative_to(folder).parts[0] if path.parent != folder else "page"
             if path.suffix == ".glb":
                 kind = "geometry"
-            elif kind == "page" and path.suffix in (".png", ".bin"):
+            elif kind in ("page", "tiles") and path.suffix in (".png", ".bin"):
                 kind = "textures"
             kinds[kind] += path.stat().st_size
     return kinds
