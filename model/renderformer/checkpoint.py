@@ -51,12 +51,16 @@ def _sort_metadata(path: Path) -> None:
         file.write(data)
 
 
-def _check_shapes(config: Any, stored: Mapping[str, tuple[int, ...]], path: Path) -> None:
-    """That the file holds the network which the config asks for, before a byte of either is allocated."""
-    if config.depth > len(stored):
-        raise InputError(f"{path} holds {len(stored)} tensors, {CONFIG} asks for {config.depth} layers")
+def _expected_shapes(config: Any, tensors: int, path: Path) -> dict[str, tuple[int, ...]]:
+    """Of the network which the config asks for, by name, with no byte of it allocated; a file has so many tensors."""
+    if config.depth > tensors:
+        raise InputError(f"{path} holds {tensors} tensors, {CONFIG} asks for {config.depth} layers")
     with torch.device("meta"):
-        expected = {name: tuple(tensor.shape) for name, tensor in build(config).state_dict().items()}
+        return {name: tuple(tensor.shape) for name, tensor in build(config).state_dict().items()}
+
+
+def _check_shapes(expected: Mapping[str, tuple[int, ...]], stored: Mapping[str, tuple[int, ...]], path: Path) -> None:
+    """That the file holds the network which the config asks for, before a byte of it is read."""
     unknown, missing = stored.keys() - expected.keys(), expected.keys() - stored.keys()
     differing = [f"{kind} parameter {_some(names)}" for kind, names in (("missing", missing), ("unknown", unknown)) if names]
     if differing:
@@ -93,11 +97,16 @@ def _some(names: Collection[str]) -> str:
     return first if len(names) <= NAMED else f"{first} and {len(names) - NAMED:,} more"
 
 
-def _wrapper_prefix(names: Collection[str]) -> str:
+def _wrapper_prefix(names: Collection[str], own: Collection[str]) -> str:
     """What a wrapper put before every name of a state dict, such as ``_orig_mod.module.``; "" for nothing.
 
-    The network's own names have no first part in common.
+    own: the network's names, which may have a first part in common, too: without tokens all of a guided one's are its head's.
     """
+    return _common_parts(names).removesuffix(_common_parts(own))
+
+
+def _common_parts(names: Collection[str]) -> str:
+    """The parts with which all names begin, up to a dot."""
     common = os.path.commonprefix(list(names)) if len(names) > 1 else ""
     return common[: common.rfind(".") + 1]
 
@@ -121,9 +130,10 @@ def load(folder: Path, say: Callable[[str], None] = _say) -> tuple[Network, dict
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             names = sorted(file.keys())
-            prefix = _wrapper_prefix(names)
+            expected = _expected_shapes(config, len(names), path)
+            prefix = _wrapper_prefix(names, expected)
             stored = {name.removeprefix(prefix): tuple(file.get_slice(name).get_shape()) for name in names}
-            _check_shapes(config, stored, path)
+            _check_shapes(expected, stored, path)
             state = {name.removeprefix(prefix): file.get_tensor(name) for name in names}
     except SafetensorError as error:
         raise InputError(f"{path} {wrong_kind(path) or _damage(path, error)}") from None

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from model.errors import InputError
 from model.renderformer import checkpoint
@@ -420,13 +421,18 @@ def test_light_is_smooth_across_the_triangles_of_a_surface_and_not_across_an_edg
 # --- checkpoints and training -------------------------------------------------------------------------------------------------
 
 
-def test_a_checkpoint_is_the_same_network_again(tmp_path):
-    model, data = network(), guided_batch()
+@pytest.mark.parametrize("tokens", ["none", "lookup", "encoder"])
+def test_a_checkpoint_is_the_same_network_again(tokens, tmp_path, capsys):
+    model, data = network(tokens=tokens), guided_batch()
     checkpoint.save(model.config, model.state_dict(), tmp_path, {"triangles": "12"})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["config.json", "model.safetensors"]
     again, trained_with = checkpoint.load(tmp_path)
     assert isinstance(again, GuidedNetwork) and again.config == model.config and trained_with == {"triangles": "12"}
-    assert torch.equal(image(again, data), image(model, data))
+    assert torch.equal(image(again, data), image(model, data)) and capsys.readouterr() == ("", "")
+    wrapped = {f"module.{name}": value for name, value in model.state_dict().items()}
+    save_file(wrapped, tmp_path / "model.safetensors")
+    again, _ = checkpoint.load(tmp_path)
+    assert torch.equal(image(again, data), image(model, data)) and "'module.'" in capsys.readouterr().err
 
 
 def test_a_checkpoint_from_before_bounces_does_without_them(tmp_path):
