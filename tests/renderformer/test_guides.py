@@ -14,7 +14,7 @@ from stages.renderformer.dataset.loader import choose, landed_bundles
 from stages.renderformer.guides import GuideCaster
 from stages.renderformer.guides.casting import POINTS, sample_ggx
 from stages.renderformer.guides.records import (
-    BOUNCES,
+    BOUNCE_RAYS,
     WEIGHT_STEPS,
     check_guides,
     decode_scene_guides,
@@ -155,7 +155,7 @@ def test_rays_leave_both_sides_of_a_triangle_by_the_cosine():
     up, down = guides.bounces[:40, 0], guides.bounces[:40, 1]
     assert (up >= 40).mean() == pytest.approx(0.75, abs=0.03) and (up < 0).mean() == pytest.approx(0.25, abs=0.03)
     assert not (down >= 40).any()
-    assert guides.bounces.shape == (40 + 48 + 1, 2, BOUNCES) and not (guides.bounces[40:88, 0] >= 0).any()  # roofs look up
+    assert guides.bounces.shape == (40 + 48 + 1, 2, BOUNCE_RAYS) and not (guides.bounces[40:88, 0] >= 0).any()  # roofs look up
     spread = np.bincount(up[up >= 40] - 40, minlength=49)[:48]
     np.testing.assert_allclose(spread.reshape(4, 12).sum(axis=1) / spread.sum(), 0.25, atol=0.03)
 

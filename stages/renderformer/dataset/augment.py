@@ -30,9 +30,14 @@ PIXELS = ("image", *LAYERS)  # (V, H, W) or (V, H, W, 3)
 PATCHES = tuple(SceneRecord.PATCH_DTYPES)  # only in examples with textured triangles
 GUIDE = "guide_"  # begins the names of guides (``stages.renderformer.guides``), only in examples that were read with them
 LIGHT_TRIANGLES, TRIANGLE_SEEN = f"{GUIDE}light_triangles", f"{GUIDE}triangle_seen"
-BOUNCES = tuple(f"{GUIDE}{name}" for name in ("bounces", "bounces_weights", "vertex"))
+BOUNCE_ARRAYS = tuple(f"{GUIDE}{name}" for name in ("bounces", "bounces_weights", "vertex"))
 PIXEL_GUIDES = tuple(f"{GUIDE}{field.name}" for field in dataclasses.fields(ViewGuides))
-PADDED = (LIGHT_TRIANGLES, TRIANGLE_SEEN, f"{GUIDE}light_seen", *BOUNCES)  # an axis counts a scene's triangles or its lamps
+PADDED = (
+    LIGHT_TRIANGLES,
+    TRIANGLE_SEEN,
+    f"{GUIDE}light_seen",
+    *BOUNCE_ARRAYS,
+)  # an axis counts a scene's triangles or its lamps
 
 
 class Relight(Section):
@@ -89,7 +94,7 @@ def scene_arrays(guides: SceneGuides) -> Batch:
     """``guide_light_triangles`` (L,), ``guide_triangle_seen`` (N, 4, L), and what else `SceneGuides` has after ``guide_``."""
     bounces = (guides.bounces, guides.bounces_weights, guides.vertex)
     arrays = {LIGHT_TRIANGLES: guides.light_triangles, TRIANGLE_SEEN: guides.light_seen}
-    return arrays | ({} if guides.bounces is None else dict(zip(BOUNCES, bounces, strict=True)))
+    return arrays | ({} if guides.bounces is None else dict(zip(BOUNCE_ARRAYS, bounces, strict=True)))
 
 
 def view_arrays(views: Sequence[ViewGuides]) -> Batch:
@@ -202,7 +207,7 @@ def _mirrored_guides(example: Batch) -> Batch:
     fields = [field.name for field in dataclasses.fields(ViewGuides)]
     views = zip(*(example[f"{GUIDE}{name}"] for name in fields), strict=True)
     mirrored = [ViewGuides(*view).mirrored() for view in views]
-    scene = SceneGuides(*(example.get(name) for name in (LIGHT_TRIANGLES, TRIANGLE_SEEN, *BOUNCES)))
+    scene = SceneGuides(*(example.get(name) for name in (LIGHT_TRIANGLES, TRIANGLE_SEEN, *BOUNCE_ARRAYS)))
     return scene_arrays(scene.mirrored()) | view_arrays(mirrored)
 
 
@@ -251,7 +256,7 @@ def collate(examples: Iterable[Batch], count: int) -> Batch:
                 row[: len(array)] = array
         elif name in PADDED:
             shape = np.max([array.shape for array in arrays], axis=0)
-            batch[name] = np.full((count, *shape), -1 if name in (LIGHT_TRIANGLES, BOUNCES[0]) else 0, arrays[0].dtype)
+            batch[name] = np.full((count, *shape), -1 if name in (LIGHT_TRIANGLES, BOUNCE_ARRAYS[0]) else 0, arrays[0].dtype)
             for row, array in zip(batch[name], arrays, strict=True):
                 row[tuple(slice(0, size) for size in array.shape)] = array
         else:

@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.errors import UserError
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster
-from stages.renderformer.guides.records import BOUNCES, SUBSAMPLES, SceneGuides, ViewGuides
+from stages.renderformer.guides.records import BOUNCE_RAYS, SUBSAMPLES, SceneGuides, ViewGuides
 from stages.renderformer.records import SceneRecord
 
 # Barycentric weights (4, 3): the centroids of the four triangles that a triangle's edge midpoints cut it into.
@@ -65,16 +65,16 @@ class GuideCaster:
 
         They are stratified over the disc that the hemisphere projects to. The numbers depend on the triangle's row alone.
         """
-        count, side = len(self._corners), int(np.sqrt(BOUNCES))
-        shape = (count, 2, BOUNCES)
+        count, side = len(self._corners), int(np.sqrt(BOUNCE_RAYS))
+        shape = (count, 2, BOUNCE_RAYS)
         random = np.random.default_rng(0).random((*shape, 4))
-        strata = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(BOUNCES, 2)
+        strata = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(BOUNCE_RAYS, 2)
         height, turn = np.moveaxis((strata + random[..., :2]) / side, -1, 0).reshape(2, -1)
         root, along = np.sqrt(random[..., 2]).ravel(), random[..., 3].ravel()
-        triangle = np.repeat(np.arange(count), 2 * BOUNCES)
+        triangle = np.repeat(np.arange(count), 2 * BOUNCE_RAYS)
         weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
         start = (self._corners[triangle] * weights[:, :, None]).sum(axis=1)
-        up = frames((self._normals[:, None] * np.array([[1.0], [-1.0]])).reshape(-1, 3)).repeat(BOUNCES, axis=0)
+        up = frames((self._normals[:, None] * np.array([[1.0], [-1.0]])).reshape(-1, 3)).repeat(BOUNCE_RAYS, axis=0)
         radius, angle = np.sqrt(height), 2 * np.pi * turn
         ways = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - height)], axis=1)
         ways = np.einsum("nij,ni->nj", up, ways)

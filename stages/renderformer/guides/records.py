@@ -20,7 +20,7 @@ from pipeline.errors import UserError
 SUBSAMPLES = 4  # rays of a pixel, 2 x 2, row by row
 MIRRORED = (1, 0, 3, 2)  # the sub-samples of a pixel whose image is flipped left to right
 WEIGHT_STEPS = 255  # of a stored barycentric weight
-BOUNCES = 16  # rays from each side of a triangle, a square number
+BOUNCE_RAYS = 16  # rays from each side of a triangle, a square number
 SCENE_MEMBER = "guides.npz"
 
 
