@@ -8,6 +8,7 @@ that step on resume, so nothing is logged twice. Many processes (``model.trainin
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import time
@@ -28,6 +29,7 @@ from model.renderformer.flops import TRAINING, ideal_seconds, peak_flops
 from model.renderformer.losses import image_loss, log_radiance
 from model.renderformer.network import to_radiance
 from model.renderformer.recipe import FitConfig
+from model.training.gradients import SideBySide
 from model.training.logs import TrainingLog
 from model.training.optimization import Average, build_optimizers, schedule, set_learning_rate
 from model.training.parallel import Group, accumulating, distribute, gather, scatter
@@ -205,6 +207,46 @@ class _State:
         return json.dumps([self.model.config.to_dict(), self.config.identity()], sort_keys=True)
 
 
+class Backward:
+    """Adds a batch's gradient to the parameters and returns its loss. loss_of: of a part of the batch, times its weight.
+
+    On several threads of a CPU scene by scene (``model.training.gradients``), unless a setting says how to go about it.
+    """
+
+    def __init__(
+        self,
+        loss_of: Callable[[Batch, float], Tensor],
+        forward: nn.Module,
+        parameters: Sequence[Tensor],
+        config: FitConfig,
+        group: Group,
+    ):
+        self.loss_of, self.forward, self.parameters, self.config, self.group = loss_of, forward, parameters, config, group
+        self.threads = 1
+        if group.device.type == "cpu" and group.world == 1 and not (config.micro_scenes or config.compile):
+            self.threads = torch.get_num_threads()
+        self.side_by_side: SideBySide | None = None
+
+    def __call__(self, batch: Batch) -> Tensor:
+        scenes = len(batch["mask"])
+        if self.threads == 1 or scenes == 1:
+            return self._in_turn(batch)
+        if self.side_by_side is None:
+            self.side_by_side = SideBySide(self.parameters, scenes, self.threads)
+        return self.side_by_side.backward(
+            [functools.partial(self.loss_of, part, weight) for part, weight, _ in parts(batch, 1)]
+        )
+
+    def _in_turn(self, batch: Batch) -> Tensor:
+        total = torch.zeros((), device=self.group.device)
+        for part, weight, last in parts(batch, self.config.micro_scenes):
+            with accumulating(self.forward, last):
+                loss = self.loss_of(part, weight)
+                loss.backward()
+                total += loss.detach()
+        return total
+
+
 def fit(
     model: Network,
     config: FitConfig,
@@ -260,19 +302,18 @@ def fit(
             log.picture("validation/reference above, prediction below", show(state.step, pairs), state.step)
         return scores
 
+    def loss_of(part: Batch, weight: float) -> Tensor:
+        y = predict(forward, model, part, group.device, precision)
+        image = torch.from_numpy(np.ascontiguousarray(part["image"])).to(group.device, non_blocking=True)
+        return weight * image_loss(y, image, lpips, config.lpips)
+
+    backward = Backward(loss_of, forward, parameters, config, group)
     base_seconds, began = state.seconds, time.perf_counter()
     work.start()
     for step, batch in enumerate(batches(state.step, config.steps), start=state.step):
         share = schedule(step, config.steps, config.warmup, config.decay_steps, config.final_lr)
         set_learning_rate(state.optimizers, share)
-        loss = torch.zeros((), device=group.device)
-        for part, weight, last in parts(batch, config.micro_scenes):
-            with accumulating(forward, last):
-                y = predict(forward, model, part, group.device, precision)
-                image = torch.from_numpy(np.ascontiguousarray(part["image"])).to(group.device, non_blocking=True)
-                part_loss = weight * image_loss(y, image, lpips, config.lpips)
-                part_loss.backward()
-                loss += part_loss.detach()
+        loss = backward(batch)
         norm = gather(nn.utils.clip_grad_norm_(parameters, config.clip))
         loss_value, norm_value = torch.stack([group.mean(loss), norm]).tolist()
         if math.isfinite(loss_value) and math.isfinite(norm_value):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -136,7 +137,7 @@ class TrainConfig(StageConfig, BatchConfig, FitConfig):
     informed_start: bool | Literal["inputs"] = True
     # Runtime
     device: str = runtime("auto")  # auto | cpu | cuda
-    threads: int | None = runtime(None, ge=1)  # CPU threads; null: torch's choice
+    threads: int | None = runtime(None, ge=1)  # CPU threads, at most one a core; null: torch's choice
     ahead: int = runtime(4, ge=1)  # batches that are read ahead
     loader_workers: int = runtime(0, ge=0)  # processes that decode them; 0: threads of this one
     skip_damaged_shards: bool = runtime(False)  # go on without the samples of shards that are missing or cut
@@ -214,8 +215,8 @@ class Train(RunStage):
         from model.renderformer.training import fit
         from stages.renderformer.dataset import Batches, Needs, ShardDataset, evaluation_samples, prefetch
 
-        if config.threads is not None:
-            torch.set_num_threads(config.threads)
+        if config.threads is not None:  # more than there are cores would only wait for one another
+            torch.set_num_threads(min(config.threads, os.cpu_count() or config.threads))
         # a well-trained network's attention is full of numbers below 1e-38, which a CPU computes many times slower than zeros;
         # before the first parallel operation, as threads take the setting of the one that starts them
         torch.set_flush_denormal(True)

@@ -16,6 +16,7 @@ from model.renderformer.flops import forward_flops
 from model.renderformer.network import RenderFormer
 from model.renderformer.recipe import FitConfig
 from model.renderformer.training import BEST, LAST, Work, fit, predict
+from model.training.gradients import SideBySide
 from model.training.logs import LOG
 from model.training.optimization import schedule
 from model.training.parallel import Group
@@ -140,6 +141,44 @@ def test_parts_of_a_batch_add_up_to_its_gradient(tmp_path):
     split, _, same = train(tmp_path / "split", stream, log_every=1, clip=1e9, micro_scenes=2)
     for a, b in zip(rows, same, strict=True):
         assert b["loss"] == pytest.approx(a["loss"], rel=1e-4) and b["grad_norm"] == pytest.approx(a["grad_norm"], rel=1e-3)
+
+
+@pytest.fixture
+def threads():
+    """Sets torch's number of threads for a test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def test_scenes_on_threads_add_up_to_the_gradient_of_the_batch(tmp_path, threads):
+    """Side by side: the same losses to rounding; the same bytes for any number of threads, also of uneven shares."""
+
+    def stream(start, stop):
+        return (batch(step, scenes=3, padded=2, textured=True) for step in range(start, stop))
+
+    def run(count):
+        threads(count)
+        return train(tmp_path / str(count), stream, log_every=1, clip=1e9)
+
+    (_, _, whole), (two, _, rows), (five, _, same) = run(1), run(2), run(5)
+    for a, b in zip(whole, rows, strict=True):
+        assert b["loss"] == pytest.approx(a["loss"], rel=1e-4) and b["grad_norm"] == pytest.approx(a["grad_norm"], rel=1e-3)
+    assert [row["loss"] for row in rows] == [row["loss"] for row in same]
+    assert all(torch.equal(a, b) for a, b in zip(two.parameters(), five.parameters(), strict=True))
+
+
+def test_a_fault_on_a_thread_is_the_fault_of_the_step(threads):
+    threads(2)
+    side_by_side = SideBySide([torch.ones(1, requires_grad=True)], 2, 2)
+    with pytest.raises(ZeroDivisionError):
+        side_by_side.backward([lambda: 1 / 0, lambda: 1 / 0])
+
+
+def test_a_part_that_uses_no_parameter_adds_nothing():
+    used, unused = torch.ones(2, requires_grad=True), torch.ones(2, requires_grad=True)
+    total = SideBySide([used, unused], 3, 2).backward([lambda weight=weight: (weight * used).sum() for weight in (1, 2, 4)])
+    assert total.item() == 14 and used.grad.tolist() == [7, 7] and unused.grad is None
 
 
 def test_averaged_weights_are_what_is_validated_and_saved(tmp_path):
