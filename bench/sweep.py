@@ -6,8 +6,7 @@
 
 Each row with its own model, optimizer, batch size and resolution; made-up scenes of ``--triangles`` triangles, or with
 ``--store`` the batches of its training, whose decoding then counts. Processor time: the mean over several steps, which the
-rows take in turn, so that other programs slow all of them alike. "busy": processor time of the first of the threads, which on
-a quiet machine is about what passes on the clock.
+rows take in turn, so that other programs slow all of them alike. "clock": what passes on the clock, on a quiet machine.
 """
 
 from __future__ import annotations
@@ -29,8 +28,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from model.renderformer.architectures import build  # noqa: E402
 from model.renderformer.losses import image_loss  # noqa: E402
-from model.renderformer.training import predict  # noqa: E402
+from model.renderformer.training import Backward, predict  # noqa: E402
 from model.training.optimization import build_optimizers  # noqa: E402
+from model.training.parallel import Group  # noqa: E402
 from pipeline.store import Store  # noqa: E402
 from pipeline.sweep import Job  # noqa: E402
 from stages.renderformer.dataset import Batches, Needs, ShardDataset  # noqa: E402
@@ -48,29 +48,36 @@ class Row:
         self.model.leak_gradient(self.train.gradient_leak)
         train = self.train
         self.updates = build_optimizers(self.model, train.optimizer, train.lr, train.muon_lr, train.weight_decay)
+        self.parameters = [p for optimizer in self.updates for group in optimizer.param_groups for p in group["params"]]
         self.batch = batches(job, self.model, arguments)
+
+    def begin(self) -> None:
+        """Go about gradients as training does with the number of threads that is set."""
         self.seconds: list[tuple[float, float, float]] = []
+        self.backward = Backward(self.loss_of, self.model, self.parameters, self.train, Group(torch.device("cpu")))
+
+    def loss_of(self, part: Any, weight: float) -> torch.Tensor:
+        image = torch.from_numpy(np.ascontiguousarray(part["image"]))
+        return weight * image_loss(predict(self.model, self.model, part, "cpu", "fp32"), image, None, 0.0)
 
     def step(self, number: int) -> None:
-        """Keeps (processor time, the first thread's, that of the optimizer)."""
-        began, first = time.process_time(), time.thread_time()
+        """Keeps (processor time, time on the clock, processor time of the optimizer)."""
         data = self.batch(number)
-        image = torch.from_numpy(np.ascontiguousarray(data["image"]))
-        image_loss(predict(self.model, self.model, data, "cpu", "fp32"), image, None, 0.0).backward()
+        began, clock = time.process_time(), time.perf_counter()
+        self.backward(data)
         middle = time.process_time()
         for optimizer in self.updates:
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         ended = time.process_time()
-        self.seconds.append((ended - began, time.thread_time() - first, ended - middle))
+        self.seconds.append((ended - began, time.perf_counter() - clock, ended - middle))
 
     def report(self, threads: int) -> float:
         """Prints the row; returns the seconds of its whole training. The first step, which also allocates, is left out."""
-        seconds, busy, optimizer = np.mean(self.seconds[1:], axis=0)
-        self.seconds.clear()
+        seconds, clock, optimizer = np.mean(self.seconds[1:], axis=0)
         parameters = sum(p.numel() for p in self.model.parameters())
         print(
-            f"{self.name:<18} {threads:>7} {parameters / 1e6:>10.2f}M {seconds:>8.3f} {busy:>8.3f} {optimizer:>12.3f} "
+            f"{self.name:<18} {threads:>7} {parameters / 1e6:>10.2f}M {seconds:>8.3f} {clock:>8.3f} {optimizer:>12.3f} "
             f"{self.train.steps:>7,} {seconds * self.train.steps / 60:>11.2f}",
             flush=True,
         )
@@ -105,10 +112,12 @@ def main() -> int:
     rows = [Row(name, job, arguments) for name, job in jobs_of(arguments.table, arguments.rows).items()]
     for threads in map(int, arguments.threads.split(",")):
         torch.set_num_threads(threads)
+        for row in rows:
+            row.begin()
         for number in range(arguments.repeats + 1):
             for row in rows:
                 row.step(number)
-        print("row                threads  parameters   step s   busy s  optimizer s   steps    all, min")
+        print("row                threads  parameters   step s  clock s  optimizer s   steps    all, min")
         total = sum(row.report(threads) for row in rows)
         print(f"{len(rows)} rows with {threads} thread(s) each: {total / 60:.1f} minutes of one core")
     return 0
