@@ -12,12 +12,15 @@ import argparse
 import functools
 import multiprocessing
 import resource
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from stages.graphics.geometry import one_thread
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before this folder, whose files have the names of packages
+
+from stages.graphics.geometry import one_thread  # noqa: E402
 
 one_thread()
 

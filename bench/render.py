@@ -31,8 +31,9 @@ kinder to it: the renderers agree to a few tenths of a per cent (a table says ho
 smallest targets, and its own truth has more noise where ours was made with path guiding. The column "mean" (of values
 clamped at 4, over the raw truth's) shows how far an image is on the whole.
 
-``--costs N`` does something else: it renders all views of N of the scenes to ``--target``, with light paths and without, and
-prints the CPU seconds a scene takes by roughness and template; with ``--caustics`` of the six views of ``bench/caustics.py``.
+``--costs N`` does something else: it renders all views of N of the scenes to ``--target``, with camera paths alone, with light
+paths, and with samples where they pay besides (``--ways`` chooses), and prints the CPU seconds a scene takes by roughness and
+template; with ``--caustics`` of the six views of ``bench/caustics.py``.
 """
 
 from __future__ import annotations
@@ -54,23 +55,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pipeline.atomic import atomic_path
-from pipeline.keys import seed_for
-from pipeline.store import Artifact
-from stages.graphics import denoising
-from stages.graphics.exr import read_rgb
-from stages.graphics.metrics import log_error
-from stages.graphics.mitsuba import backend as backends
-from stages.renderformer.records import SceneRecord
-from stages.renderformer.rendering.render import render_views
-from stages.renderformer.rendering.settings import MODES, RenderSettings
-from stages.renderformer.s04_render import Render
-from stages.renderformer.scenes.released import load_scene
-from stages.renderformer.views import encode_view, view_members
-
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # before this folder, whose files have the names of packages
+
+import numpy as np  # noqa: E402
+
+from pipeline.atomic import atomic_path  # noqa: E402
+from pipeline.keys import seed_for  # noqa: E402
+from pipeline.store import Artifact  # noqa: E402
+from stages.graphics import denoising  # noqa: E402
+from stages.graphics.exr import read_rgb  # noqa: E402
+from stages.graphics.metrics import log_error  # noqa: E402
+from stages.graphics.mitsuba import backend as backends  # noqa: E402
+from stages.renderformer.records import SceneRecord  # noqa: E402
+from stages.renderformer.rendering.render import render_views  # noqa: E402
+from stages.renderformer.rendering.settings import MODES, RenderSettings  # noqa: E402
+from stages.renderformer.s04_render import Render  # noqa: E402
+from stages.renderformer.scenes.released import load_scene  # noqa: E402
+from stages.renderformer.views import encode_view, view_members  # noqa: E402
+
 MAX_DEPTH = 34  # segments; Cycles: 32 bounces
 CHUNK = 256  # samples per pixel in one call for a truth
 GUIDED = 1e-9  # target error out of reach: a truth is made with path guiding
@@ -654,15 +657,16 @@ def print_productions(views: list[View], productions: dict[str, Production]) -> 
 
 
 def print_costs(arguments: argparse.Namespace, backend: dict[str, Any], scenes: list[SceneRecord]) -> None:
-    """CPU seconds to render all views of each scene to the target error, with and without light paths, side by side."""
+    """CPU seconds to render all views of each scene to the target error, by each of the ways, scene by scene."""
     from stages.renderformer.rendering import caustics
 
-    alphas = {"before": 0.0, "after": caustics.NARROW_ALPHA}  # of the narrow parts: nothing, or what light paths serve
+    served = caustics.NARROW_ALPHA  # of the narrow parts: nothing, or what light paths serve
+    ways = {"camera": (0.0, False), "light": (served, False), "adaptive": (served, True)}
+    ways = {name: ways[name] for name in arguments.ways}
     rows: list[tuple[list[str], dict[str, tuple[float, list[dict]]]]] = []
     for scene in scenes:
         spent = {}
-        for name, alpha in alphas.items():
-            caustics.NARROW_ALPHA = alpha
+        for name, (caustics.NARROW_ALPHA, adaptive) in ways.items():
             if not rows:
                 warm_up(scene, backend, arguments.threads)
             settings = RenderSettings(
@@ -672,6 +676,7 @@ def print_costs(arguments: argparse.Namespace, backend: dict[str, Any], scenes: 
                 arguments.target,
                 max_depth=MAX_DEPTH,
                 mode=arguments.mode,
+                adaptive=adaptive,
             )
             began = time.process_time()
             views = render_views(scene, settings, backend, threads=arguments.threads)
@@ -683,12 +688,12 @@ def print_costs(arguments: argparse.Namespace, backend: dict[str, Any], scenes: 
         rows.append((["all", f"roughness {kind}", scene.meta.get("template", "-"), *([scene.id] * arguments.caustics)], spent))
         told = ", ".join(f"{name} {seconds:.1f} s" for name, (seconds, _) in spent.items())
         progress(f"{scene.id} ({', '.join(rows[-1][0][1:3])}): {told}")
-    titles = ["scenes", "number", *(f"{name}: {what}" for name in alphas for what in ("mean s", "p50", "p90", "over target"))]
+    titles = ["scenes", "number", *(f"{name}: {what}" for name in ways for what in ("mean s", "p50", "p90", "over target"))]
     printed = []
     for group in sorted({group for groups, _ in rows for group in groups}):
         of_group = [spent for groups, spent in rows if group in groups]
         row = [group, str(len(of_group))]
-        for name in alphas:
+        for name in ways:
             seconds = [spent[name][0] for spent in of_group]
             over = [meta["error"] > arguments.target for spent in of_group for meta in spent[name][1]]
             row += [
@@ -696,7 +701,9 @@ def print_costs(arguments: argparse.Namespace, backend: dict[str, Any], scenes: 
                 f"{np.mean(over):.0%}",
             ]
         printed.append(row)
-    table([*titles, "after over before"], [[*row, f"{float(row[6]) / max(float(row[2]), 0.01):.2f}"] for row in printed])
+    last = 2 + 4 * (len(ways) - 1)
+    over = f"{list(ways)[-1]} over {list(ways)[0]}"
+    table([*titles, over], [[*row, f"{float(row[last]) / max(float(row[2]), 0.01):.2f}"] for row in printed])
 
 
 def print_machine(arguments: argparse.Namespace, backend: dict[str, Any]) -> None:
@@ -763,6 +770,12 @@ def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--costs", type=whole, metavar="N", help="only CPU seconds, of so many scenes")
     parser.add_argument("--caustics", action="store_true", help="with --costs: of the six views of bench/caustics.py")
+    parser.add_argument(
+        "--ways",
+        type=lambda text: text.split(","),
+        default=["camera", "light", "adaptive"],
+        help="with --costs; default all three",
+    )
     parser.add_argument("--mode", choices=MODES, default="physical", help="with --costs; default %(default)s")
     parser.add_argument("--backend", choices=backends.CHOICES, default="auto")
     parser.add_argument("--threads", type=whole, default=os.cpu_count(), help="for each renderer, default all (%(default)s)")

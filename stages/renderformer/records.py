@@ -144,9 +144,9 @@ class ViewRecord:
     depth: (H, W) float32, distance along the ray in scene units, 0 where nothing was hit. coverage: (H, W) float32 in [0, 1].
     triangle, object: (H, W) int32, what the pixel's first sample hit: row of ``SceneRecord.triangles`` and its
         ``object_index``; -1 for nothing.
-    meta: JSON. ``index`` (camera), ``status`` ok|dark|too_close, ``mean``, ``nearest``, ``spp``, ``error`` (estimated, see
-        ``stages.renderformer.rendering.error``), ``dropped`` (samples from before guiding that are not in it), ``denoiser``
-        fast|high|null, ``clamped`` half-floats.
+    meta: JSON. ``index`` (camera), ``status`` ok|dark|too_close, ``mean``, ``nearest``, ``spp`` (the pixels' mean), ``error``
+        (estimated, see ``stages.renderformer.rendering.error``), ``dropped`` (samples from before guiding that are not in it),
+        ``denoiser`` fast|high|null, ``clamped`` half-floats.
     """
 
     lights: np.ndarray

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from pipeline.config import StageConfig, runtime
+from pipeline.config import StageConfig, added, runtime
 from pipeline.errors import Reject
 from pipeline.keys import seed_for
 from pipeline.stage import Inputs, Item, MapStage, Record
@@ -38,6 +38,7 @@ class RenderConfig(StageConfig):
     max_depth: int = Field(34, ge=2)  # longest path in segments: 34 is 32 bounces besides direct light
     denoise: bool = True  # Open Image Denoise, every light on its own
     lights_visible: bool = False  # whether cameras see lights; reflections always do
+    adaptive: bool = added(False, False)  # samples beyond the first 16 go to the pixels that need them
     noise_share: float = Field(0.01, ge=0, le=1)  # of the views, rendered twice to tell the dataset's noise floor
     backend: Literal["auto", "cuda", "llvm", "scalar"] = runtime("auto")  # auto: the best that works here
 

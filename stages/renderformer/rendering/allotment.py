@@ -18,7 +18,7 @@ class Allotment:
     def __init__(self, size: tuple[int, int]):
         self.pixels, self.paths, self.ratio = size[0] * size[1], 0, FIRST
 
-    def window(self, spp: int) -> tuple[int, int]:
+    def window(self, spp: float) -> tuple[int, int]:
         """First and last but one of the path numbers that are due beside ``spp`` camera paths per pixel in all."""
         first = self.paths
         self.paths = max(first, round(self.ratio * self.pixels * spp))
@@ -26,16 +26,16 @@ class Allotment:
 
     def weigh(self, a: Sums, b: Sums) -> None:
         """Choose the ratio that leaves least noise at equal cost, from the sums of two streams."""
-        if not (a.paths and a.spp):
+        if not (a.paths and a.mean_spp):
             return
-        camera, light = ([getattr(s, name).sum(axis=0) / count(s) for s in (a, b)] for name, count in PARTS)
+        camera, light = ([per_path(s, getattr(s, name).sum(axis=0)) for s in (a, b)] for name, per_path in PARTS)
         image = (camera[0] + camera[1] + light[0] + light[1]) / 2
         of_camera, of_light = (_noise(image, first - second) for first, second in (camera, light))
-        now = a.paths / (a.spp * self.pixels)
+        now = a.paths / (a.mean_spp * self.pixels)
         self.ratio = float(np.clip(of_light / max(of_camera, 1e-12) * np.sqrt(now / COST), *RANGE))
 
 
-PARTS = (("lights", lambda sums: sums.spp), ("caustics", lambda sums: sums.paths))
+PARTS = (("lights", lambda sums, values: sums.per_sample(values)), ("caustics", lambda sums, values: values / sums.paths))
 
 
 def _noise(image: np.ndarray, difference: np.ndarray) -> float:

@@ -368,16 +368,36 @@ class JitRenderer:
                 paths = min(int(SHARE * self.pixels * spp), PHOTONS)
                 photons = self.light_paths.photons(number, streams, self.pixels * first, paths)
             passes.append(self._pass(table, number, self.cameras, photons, ids, streams, first, spp))
-        shape = (len(streams), len(views), *self.size)
+        return self._sums(passes, len(streams), len(views), spp)
+
+    def _sums(self, passes: list[dict[str, np.ndarray]], streams: int, views: int, spp: int | np.ndarray) -> list[list[Sums]]:
+        """Per stream and view, from what the passes over the lights brought, (streams, pixels of all views, ..)."""
+        shape = (streams, views, *self.size)
         lights = np.concatenate([p["lights"] for p in passes], axis=-2)[..., : self.record.n_lights, :]
         hit = passes[0]  # the camera rays of all passes are the same
         images = {name: values.reshape(*shape, *values.shape[2:]) for name, values in hit.items()}
         images["direct"] = sum(p["direct"] for p in passes).reshape(*shape, 3)
         images["lights"] = np.moveaxis(lights.reshape(*shape, -1, 3), -2, 2)
         return [
-            [Sums(spp, **{name: image[stream, view] for name, image in images.items()}) for view in range(len(views))]
-            for stream in range(len(streams))
+            [Sums(spp, **{name: image[stream, view] for name, image in images.items()}) for view in range(views)]
+            for stream in range(streams)
         ]
+
+    def more(self, view: int, streams: list[int], before: np.ndarray, after: np.ndarray, place: int) -> list[Sums]:
+        """Per stream, the sums of one view over samples that differ from pixel to pixel in number.
+
+        Of each pixel the samples from ``before`` on, up to ``after``, both (H, W). place: samples of all pixels that stand for
+        those so far: from there on are the light paths that no other call has.
+        """
+        first, count = before.ravel(), (after - before).ravel()
+        passes = []
+        for number, table in enumerate(self.passes):
+            photons = None
+            if self.light_paths:
+                paths = min(max(int(SHARE * count.sum()), 1), PHOTONS)
+                photons = self.light_paths.photons(number, streams, self.pixels * place, paths)
+            passes.append(self._uneven_pass(table, number, photons, view, streams, first, count))
+        return [sums for (sums,) in self._sums(passes, len(streams), 1, after - before)]
 
     def add_caustics(self, sums: list[Sums], views: list[int], stream: int, windows: list[tuple[int, int]]) -> None:
         """Add to the sums of each of the ``views`` what the stream's light paths bring, from the first to the last but one of
@@ -402,9 +422,7 @@ class JitRenderer:
         spp: int,
     ) -> dict[str, np.ndarray]:
         """(streams, pixels, ..) sums over the samples, float64; ``lights`` (.., lights of the pass, 3)."""
-        # of resolution and samples alone, since it decides how sums are rounded
-        fitting = self.pixels * spp // LANES
-        size = min(max(1 << fitting.bit_length() >> 1, BLOCKS[0]), BLOCKS[1])
+        size = _block(self.pixels * spp)  # of resolution and samples alone, since it decides how sums are rounded
         rows, blocks = len(streams) * len(ids), -(-spp // size)
         sums: dict[str, np.ndarray] = {}
         for block in range(0, blocks, GROUP):
@@ -435,6 +453,57 @@ class JitRenderer:
                         total[..., part] += parts.sum(axis=-1, dtype=np.float64)
         shape = (len(streams), len(ids))
         return {name: np.moveaxis(total, -1, 0).reshape(*shape, *total.shape[:-1]) for name, total in sums.items()}
+
+    def _uneven_pass(
+        self,
+        table: LightTable,
+        number: int,
+        photons: Photons | None,
+        view: int,
+        streams: list[int],
+        first: np.ndarray,
+        count: np.ndarray,
+    ) -> dict[str, np.ndarray]:
+        """As `_pass`, of one view, whose pixels have samples of their own, (pixels,) each."""
+        size, pixels = _block(int(count.sum())), np.flatnonzero(count)
+        blocks = np.tile(-(-count[pixels] // size), len(streams))
+        rows = len(blocks)  # of pixels that have samples, stream by stream
+        row = np.arange(rows).repeat(blocks)
+        block = np.arange(len(row)) - (np.cumsum(blocks) - blocks)[row]
+        pixel = pixels[row % len(pixels)]
+        stream = np.asarray(streams)[row // len(pixels)]
+        sums: dict[str, np.ndarray] = {}
+        ends = np.cumsum(blocks)
+        start = 0
+        while start < len(row):  # whole pixels, so that chunks do not decide how sums are rounded
+            end = int(ends[max(np.searchsorted(ends, start + CHUNK, "right") - 1, row[start])])
+            part, start = slice(start, end), end
+            inside, starts = np.unique(row[part], return_index=True)
+            where = (
+                pixel[part] + view * self.pixels,
+                stream[part],
+                row[part] // len(pixels),
+                first[pixel[part]] + block[part] * size,
+                np.minimum(size, count[pixel[part]] - block[part] * size),
+            )
+            for name, value in self._chunk(table, number, self.cameras, photons, *where).items():
+                if name == "triangle":  # of the first sample, which another call has taken
+                    sums.setdefault(name, np.full(rows, -1, np.int32))
+                elif name == "nearest":
+                    total = sums.setdefault(name, np.full(rows, np.inf, np.float32))
+                    total[inside] = np.minimum(total[inside], np.minimum.reduceat(value, starts))
+                else:
+                    total = sums.setdefault(name, np.zeros((*value.shape[:-1], rows)))
+                    total[..., inside] += np.add.reduceat(value.astype(np.float64), starts, axis=-1)
+        return {name: self._spread(total, len(streams), pixels) for name, total in sums.items()}
+
+    def _spread(self, values: np.ndarray, streams: int, pixels: np.ndarray) -> np.ndarray:
+        """(.., streams x some pixels) -> (streams, all pixels, ..); the others had no samples."""
+        nothing = {np.dtype(np.int32): -1, np.dtype(np.float32): np.inf}.get(values.dtype, 0)
+        rows = np.moveaxis(values, -1, 0).reshape(streams, len(pixels), *values.shape[:-1])
+        whole = np.full((streams, self.pixels, *rows.shape[2:]), nothing, values.dtype)
+        whole[:, pixels] = rows
+        return whole
 
     def _chunk(
         self,
@@ -483,6 +552,11 @@ class JitRenderer:
             "nearest": nearest.numpy(),
             "triangle": triangle.numpy(),
         }
+
+
+def _block(samples: int) -> int:
+    """Samples of a lane, where a view takes so many."""
+    return min(max(1 << (samples // LANES).bit_length() >> 1, BLOCKS[0]), BLOCKS[1])
 
 
 def _channels(value, size: int) -> np.ndarray:

@@ -21,8 +21,9 @@ from pipeline.errors import UserError
 from stages.graphics.denoising import denoise as denoise_layer
 from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.records import SceneRecord, ViewRecord
+from stages.renderformer.rendering.adaptive import next_counts
 from stages.renderformer.rendering.allotment import Allotment
-from stages.renderformer.rendering.error import Judge
+from stages.renderformer.rendering.error import Judge, ThriftyJudge
 from stages.renderformer.rendering.settings import RenderSettings
 from stages.renderformer.rendering.sums import Sums
 from stages.renderformer.views import clamped_values
@@ -47,6 +48,7 @@ def render_views(
     backends.activate(backend, threads)
     target_error, max_spp, denoise = settings.target_error, settings.max_spp, settings.denoise
     renderer = _renderer(scene, settings, backend)
+    adaptive = settings.adaptive and backend["backend"] != "scalar"
     records = {}
     active = list(range(len(scene.camera_to_world))) if views is None else list(views)
     order, sampled_spp = list(active), 0
@@ -55,7 +57,10 @@ def render_views(
     total = max_spp // len(streams)  # of each stream
     step = min(FIRST_SPP // 2, total) if len(streams) > 1 else total
     parts: dict[int, list[Sums]] = {view: [] for view in active}  # per stream
-    judges = {view: Judge(target_error, denoise) for view in active}
+    judges = {
+        view: ThriftyJudge(target_error, denoise, scene.n_lights + 1, max_spp) if adaptive else Judge(target_error, denoise)
+        for view in active
+    }
     allotments = {view: Allotment(settings.size) for view in active}
     due = dict.fromkeys(active, 0.0)  # samples of a stream before which an estimate is not worth its cost
     while active:
@@ -88,13 +93,54 @@ def render_views(
                 records[view].meta |= {"dropped": len(streams) * sampled_spp - sums.spp, "stalled": stalled}
                 del parts[view]
                 continue
+            dropped = renderer.guided and sampled_spp == step and total >= 2 * sampled_spp and error > FAR * target_error
+            if adaptive and not dropped:
+                uneven = _Uneven(of_streams, sampled_spp, judges[view], allotments[view])
+                records[view] = uneven.finish(renderer, view, streams, settings, scene)
+                del parts[view]
+                continue
             unfinished.append(view)
-            if renderer.guided and sampled_spp == step and total >= 2 * sampled_spp and error > FAR * target_error:
+            if dropped:
                 parts[view] = []  # guided samples are so much better that these would only harm
             else:  # no error falls faster than by the square root, and denoised ones do not reach it
                 due[view] = sampled_spp + ((error / target_error) ** (2.5 if denoise else 2.0) - 1) * of_streams[0].spp
         active, step = unfinished, min(_next(sampled_spp) - sampled_spp, total - sampled_spp)
     return [records[view] for view in order]
+
+
+class _Uneven:
+    """A view that goes on with samples where they pay, from the sums of the streams over the same samples of each pixel."""
+
+    def __init__(self, of_streams: list[Sums], sampled: int, judge: Judge, allotment: Allotment):
+        self.of_streams, self.judge, self.allotment = of_streams, judge, allotment
+        self.place = sampled  # samples of all pixels that stand for those so far
+
+    def finish(self, renderer: Any, view: int, streams: list[int], settings: RenderSettings, scene: SceneRecord) -> ViewRecord:
+        """Until the target is met or out of reach."""
+        counts = np.full(settings.size, self.of_streams[0].spp)
+        earlier = self.place - self.of_streams[0].spp  # samples that do not count any more
+        most = settings.max_spp // len(streams)
+        while True:
+            after = next_counts(counts, self.judge.shares, settings.target_error, most)
+            renderer.learn([view])
+            new = renderer.more(view, streams, counts + earlier, after + earlier, self.place)
+            self.place += -(-int((after - counts).sum()) // counts.size)
+            counts = after
+            if renderer.light_paths:
+                window = self.allotment.window(float(counts.mean()))
+                for stream, sums in zip(streams, new, strict=True):
+                    renderer.add_caustics([sums], [view], stream, [window])
+            self.of_streams = [before + more for before, more in zip(self.of_streams, new, strict=True)]
+            sums = functools.reduce(operator.add, self.of_streams)
+            all_samples, *halves = (part.view(scene.object_index) for part in (sums, *self.of_streams))
+            self.allotment.weigh(*self.of_streams)
+            quality, error = self.judge.error(sums.mean_spp, *halves, all_samples)
+            full = not (next_counts(counts, self.judge.shares, settings.target_error, most) > counts).any()
+            stalled = error > settings.target_error and not full and self.judge.stalled(sums.mean_spp, settings.max_spp)
+            if error <= settings.target_error or full or stalled:
+                record = _finish(all_samples, sums, view, quality, error)
+                record.meta |= {"dropped": len(streams) * earlier, "stalled": bool(stalled)}
+                return record
 
 
 def _next(samples: int) -> int:
@@ -140,7 +186,7 @@ def _finish(view: ViewRecord, sums: Sums, index: int, quality: str | None, error
         "index": int(index),
         "status": "too_close" if nearest < MIN_DEPTH else "dark" if mean < MIN_MEAN else "ok",
         "mean": mean,
-        "spp": sums.spp,
+        "spp": round(sums.mean_spp),
         "error": error,
         "denoiser": quality,
         "clamped": clamped_values(view),

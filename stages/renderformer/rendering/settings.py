@@ -23,6 +23,8 @@ class RenderSettings:
     mode: ``physical`` or ``cycles`` (``stages.renderformer.rendering.render``).
     max_depth: longest path in segments; 2 is direct light only.
     denoise: Open Image Denoise, every light on its own.
+    adaptive: samples behind the first go where they pay (``stages.renderformer.rendering.adaptive``), no longer to all pixels
+        alike. The scalar backend knows no such thing.
     lights_visible: whether camera rays see lights; reflections always do.
     """
 
@@ -34,6 +36,7 @@ class RenderSettings:
     max_depth: int = 34
     denoise: bool = True
     lights_visible: bool = False
+    adaptive: bool = False
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
