@@ -46,101 +46,119 @@ def render_views(
     backend: from ``stages.graphics.mitsuba.backend.choose``. threads: of this process; None: all cores.
     """
     backends.activate(backend, threads)
-    target_error, max_spp, denoise = settings.target_error, settings.max_spp, settings.denoise
     renderer = _renderer(scene, settings, backend)
     adaptive = settings.adaptive and backend["backend"] != "scalar"
-    records = {}
-    active = list(range(len(scene.camera_to_world))) if views is None else list(views)
-    order, sampled_spp = list(active), 0
     # With a target, two streams that share no path: what tells noise from image.
-    streams = [0, 1] if target_error > 0 and max_spp > 1 else [0]
-    total = max_spp // len(streams)  # of each stream
+    streams = [0, 1] if settings.target_error > 0 and settings.max_spp > 1 else [0]
+    total = settings.max_spp // len(streams)  # of each stream
+    indices = range(len(scene.camera_to_world)) if views is None else views
+    progresses = [_Progress(index, scene, settings, adaptive) for index in indices]
+    active, sampled = list(progresses), 0
     step = min(FIRST_SPP // 2, total) if len(streams) > 1 else total
-    parts: dict[int, list[Sums]] = {view: [] for view in active}  # per stream
-    judges = {
-        view: ThriftyJudge(target_error, denoise, scene.n_lights + 1, max_spp) if adaptive else Judge(target_error, denoise)
-        for view in active
-    }
-    allotments = {view: Allotment(settings.size) for view in active}
-    due = dict.fromkeys(active, 0.0)  # samples of a stream before which an estimate is not worth its cost
     while active:
-        if sampled_spp:
-            renderer.learn(active)
-        sampled = renderer.sample(active, streams, sampled_spp, step)
-        sampled_spp += step
-        if renderer.light_paths:
-            windows = [allotments[view].window(sampled_spp) for view in active]
-            for stream, of_views in zip(streams, sampled, strict=True):
-                renderer.add_caustics(of_views, active, stream, windows)
+        of_streams = _sample(renderer, active, streams, sampled, step)
+        sampled += step
         unfinished = []
-        for view, new in zip(active, zip(*sampled, strict=True), strict=True):
-            of_streams = parts[view] = (
-                [before + more for before, more in zip(parts[view], new, strict=True)] if parts[view] else list(new)
-            )
-            if 1.5 * sampled_spp <= due[view] and sampled_spp < total:  # even the next count would not do
+        for view, new in zip(active, zip(*of_streams, strict=True), strict=True):
+            view.add(new)
+            if 1.5 * sampled <= view.due and sampled < total:  # even the next count would not do
                 unfinished.append(view)
                 continue
-            sums = functools.reduce(operator.add, of_streams)
-            all_samples, *halves = (part.view(scene.object_index) for part in (sums, *of_streams))
-            quality, error = "high" if denoise else None, None
-            if len(halves) > 1:
-                allotments[view].weigh(*of_streams)
-                quality, error = judges[view].error(sums.spp, *halves, all_samples)
-            done = sampled_spp == total or error is None or error <= target_error
-            stalled = not done and judges[view].stalled(sums.spp, max_spp)
-            if done or stalled:
-                records[view] = _finish(all_samples, sums, view, quality, error)
-                records[view].meta |= {"dropped": len(streams) * sampled_spp - sums.spp, "stalled": stalled}
-                del parts[view]
+            view.estimate()
+            if sampled == total or view.ends():
+                view.finish(sampled)
                 continue
-            dropped = renderer.guided and sampled_spp == step and total >= 2 * sampled_spp and error > FAR * target_error
+            dropped = renderer.guided and sampled == step and total >= 2 * sampled and view.error > FAR * settings.target_error
             if adaptive and not dropped:
-                uneven = _Uneven(of_streams, sampled_spp, judges[view], allotments[view])
-                records[view] = uneven.finish(renderer, view, streams, settings, scene)
-                del parts[view]
+                _finish_unevenly(renderer, view, streams, sampled, total)
                 continue
             unfinished.append(view)
             if dropped:
-                parts[view] = []  # guided samples are so much better that these would only harm
-            else:  # no error falls faster than by the square root, and denoised ones do not reach it
-                due[view] = sampled_spp + ((error / target_error) ** (2.5 if denoise else 2.0) - 1) * of_streams[0].spp
-        active, step = unfinished, min(_next(sampled_spp) - sampled_spp, total - sampled_spp)
-    return [records[view] for view in order]
+                view.parts = []  # guided samples are so much better that these would only harm
+            else:
+                view.wait(sampled)
+        active, step = unfinished, min(_next(sampled) - sampled, total - sampled)
+    return [view.record for view in progresses]
 
 
-class _Uneven:
-    """A view that goes on with samples where they pay, from the sums of the streams over the same samples of each pixel."""
+def _sample(renderer: Any, views: Sequence[_Progress], streams: list[int], sampled: int, step: int) -> list[list[Sums]]:
+    """Per stream and view the sums of ``step`` more samples of every pixel."""
+    indices = [view.index for view in views]
+    if sampled:
+        renderer.learn(indices)
+    of_streams = renderer.sample(indices, streams, sampled, step)
+    if renderer.light_paths:
+        windows = [view.allotment.window(sampled + step) for view in views]
+        for stream, of_views in zip(streams, of_streams, strict=True):
+            renderer.add_caustics(of_views, indices, stream, windows)
+    return of_streams
 
-    def __init__(self, of_streams: list[Sums], sampled: int, judge: Judge, allotment: Allotment):
-        self.of_streams, self.judge, self.allotment = of_streams, judge, allotment
-        self.place = sampled  # samples of all pixels that stand for those so far
 
-    def finish(self, renderer: Any, view: int, streams: list[int], settings: RenderSettings, scene: SceneRecord) -> ViewRecord:
-        """Until the target is met or out of reach."""
-        counts = np.full(settings.size, self.of_streams[0].spp)
-        earlier = self.place - self.of_streams[0].spp  # samples that do not count any more
-        most = settings.max_spp // len(streams)
-        while True:
-            after = next_counts(counts, self.judge.shares, settings.target_error, most)
-            renderer.learn([view])
-            new = renderer.more(view, streams, counts + earlier, after + earlier, self.place)
-            self.place += -(-int((after - counts).sum()) // counts.size)
-            counts = after
-            if renderer.light_paths:
-                window = self.allotment.window(float(counts.mean()))
-                for stream, sums in zip(streams, new, strict=True):
-                    renderer.add_caustics([sums], [view], stream, [window])
-            self.of_streams = [before + more for before, more in zip(self.of_streams, new, strict=True)]
-            sums = functools.reduce(operator.add, self.of_streams)
-            all_samples, *halves = (part.view(scene.object_index) for part in (sums, *self.of_streams))
-            self.allotment.weigh(*self.of_streams)
-            quality, error = self.judge.error(sums.mean_spp, *halves, all_samples)
-            full = not (next_counts(counts, self.judge.shares, settings.target_error, most) > counts).any()
-            stalled = error > settings.target_error and not full and self.judge.stalled(sums.mean_spp, settings.max_spp)
-            if error <= settings.target_error or full or stalled:
-                record = _finish(all_samples, sums, view, quality, error)
-                record.meta |= {"dropped": len(streams) * earlier, "stalled": bool(stalled)}
-                return record
+def _finish_unevenly(renderer: Any, view: _Progress, streams: list[int], sampled: int, most: int) -> None:
+    """Go on with samples where they pay until the view ends, or no pixel may have more. most: of a stream and pixel."""
+    counts = np.full(view.settings.size, view.parts[0].spp)
+    earlier = sampled - view.parts[0].spp  # samples that do not count any more
+    place = sampled  # samples of all pixels that stand for those so far
+    while ((after := next_counts(counts, view.judge.shares, view.settings.target_error, most)) > counts).any():
+        renderer.learn([view.index])
+        new = renderer.more(view.index, streams, counts + earlier, after + earlier, place)
+        place += -(-int((after - counts).sum()) // counts.size)
+        counts = after
+        if renderer.light_paths:
+            window = view.allotment.window(float(counts.mean()))
+            for stream, sums in zip(streams, new, strict=True):
+                renderer.add_caustics([sums], [view.index], stream, [window])
+        view.add(new)
+        view.estimate()
+        if view.ends():
+            break
+    view.finish(earlier + view.parts[0].mean_spp)
+
+
+class _Progress:
+    """A view on its way: the sums of its streams, what they tell of its error, and in the end its record."""
+
+    def __init__(self, index: int, scene: SceneRecord, settings: RenderSettings, adaptive: bool):
+        self.index, self.scene, self.settings = index, scene, settings
+        judged = settings.target_error, settings.denoise
+        self.judge = ThriftyJudge(*judged, scene.n_lights + 1, settings.max_spp) if adaptive else Judge(*judged)
+        self.allotment = Allotment(settings.size)
+        self.parts: list[Sums] = []  # per stream
+        self.due = 0.0  # samples of a stream before which an estimate is not worth its cost
+        self.stalled = False
+
+    def add(self, new: Sequence[Sums]) -> None:
+        """More samples, per stream."""
+        self.parts = [before + more for before, more in zip(self.parts, new, strict=True)] if self.parts else list(new)
+
+    def estimate(self) -> None:
+        """Judge the samples so far; one stream tells no error."""
+        self.sums = functools.reduce(operator.add, self.parts)
+        self.image, *halves = (part.view(self.scene.object_index) for part in (self.sums, *self.parts))
+        self.quality, self.error = "high" if self.settings.denoise else None, None
+        if len(halves) > 1:
+            self.allotment.weigh(*self.parts)
+            self.quality, self.error = self.judge.error(self.sums.mean_spp, *halves, self.image)
+
+    def ends(self) -> bool:
+        """Whether the target is met, or out of reach."""
+        if self.error is None or self.error <= self.settings.target_error:
+            return True
+        self.stalled = self.judge.stalled(self.sums.mean_spp, self.settings.max_spp)
+        return self.stalled
+
+    def wait(self, sampled: int) -> None:
+        """Estimate no more before enough samples: no error falls faster than by the square root, and denoised ones do not
+        reach it."""
+        power = 2.5 if self.settings.denoise else 2.0
+        self.due = sampled + ((self.error / self.settings.target_error) ** power - 1) * self.parts[0].spp
+
+    def finish(self, sampled: float) -> None:
+        """The record. sampled: all samples of a stream, also those that do not count."""
+        self.record = _finish(self.image, self.sums, self.index, self.quality, self.error)
+        dropped = len(self.parts) * sampled - self.sums.mean_spp
+        self.record.meta |= {"dropped": round(dropped), "stalled": self.stalled}
+        self.parts = []
 
 
 def _next(samples: int) -> int:
