@@ -11,7 +11,7 @@ from stages.renderformer.rendering.adaptive import AIM, CELL, CELL_GROWTH, LEAST
 from stages.renderformer.rendering.error import ThriftyJudge
 from stages.renderformer.s04_render import RenderConfig
 from tests.renderformer.fakes import path_traced
-from tests.renderformer.test_caustics import hashed, mirrors, renderer, views  # noqa: F401 (a fixture)
+from tests.renderformer.test_caustics import hashed, mirrors, renderer, two_views, views  # noqa: F401 (a fixture)
 from tests.renderformer.test_rendering import caustic, jit  # noqa: F401 (a fixture)
 
 
@@ -70,10 +70,7 @@ def test_bytes_depend_on_neither_threads_chunks_nor_other_views(jit, monkeypatch
     from stages.renderformer.rendering import caustics
     from stages.renderformer.rendering import jit as module
 
-    scene = mirrors()
-    scene.camera_to_world = np.repeat(scene.camera_to_world, 2, axis=0)
-    scene.camera_to_world[1, :3, 3] += (0.2, 0, 0.1)
-    scene.fov_deg = np.repeat(scene.fov_deg, 2)
+    scene = two_views()
     kept = {"max_spp": 128, "target_error": 1e-9, "seed": 2, "backend": jit, "denoise": False, "adaptive": True}
     whole = hashed(path_traced(scene, 24, threads=1, **kept))
     assert hashed(path_traced(scene, 24, threads=2, **kept)) == whole

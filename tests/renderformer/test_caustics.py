@@ -89,6 +89,15 @@ def test_light_paths_have_less_noise(jit, views):  # noqa: F811
     assert noise[True] < 0.4 * noise[False]
 
 
+def two_views():
+    """`mirrors`, seen by two cameras."""
+    scene = mirrors()
+    scene.camera_to_world = np.repeat(scene.camera_to_world, 2, axis=0)
+    scene.camera_to_world[1, :3, 3] += (0.2, 0, 0.1)
+    scene.fov_deg = np.repeat(scene.fov_deg, 2)
+    return scene
+
+
 def hashed(views):
     return [hashlib.sha256(b"".join(encode_view(view).values())).hexdigest() for view in views]
 
@@ -96,10 +105,7 @@ def hashed(views):
 def test_bytes_depend_neither_on_threads_nor_on_chunks_or_views(jit, monkeypatch):  # noqa: F811
     from stages.renderformer.rendering import caustics as module
 
-    scene = mirrors()
-    scene.camera_to_world = np.repeat(scene.camera_to_world, 2, axis=0)
-    scene.camera_to_world[1, :3, 3] += (0.2, 0, 0.1)
-    scene.fov_deg = np.repeat(scene.fov_deg, 2)
+    scene = two_views()
     kept = {"max_spp": 48, "target_error": 1e-9, "seed": 2, "backend": jit, "denoise": False}
     whole = hashed(path_traced(scene, 16, threads=1, **kept))
     assert hashed(path_traced(scene, 16, threads=2, **kept)) == whole

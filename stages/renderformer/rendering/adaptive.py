@@ -28,7 +28,7 @@ def next_counts(counts: np.ndarray, error: np.ndarray, target: float, most: int)
     area = np.bincount(cell.ravel())
     shape = (rows[-1] + 1, columns[-1] + 1)
     mean = (np.bincount(cell.ravel(), error.ravel()) / area).reshape(shape)
-    now = (np.bincount(cell.ravel(), counts.ravel()) / area).round()
+    now = counts[::CELL, ::CELL].ravel().astype(float)
     around = np.maximum(uniform_filter(mean, 3, mode="nearest"), 0).ravel()  # its running sums leave rounding below nothing
     noise = around * np.sqrt(now)  # of one sample
     growing = (noise > 0) & (now < most)
@@ -43,13 +43,11 @@ def next_counts(counts: np.ndarray, error: np.ndarray, target: float, most: int)
         after = wanted(scale)
         return area @ after >= GROWTH * (area @ now) or area @ (noise / np.sqrt(after)) <= AIM * target * area.sum()
 
-    low, high = (
-        0.0,
-        float(((CELL_GROWTH * now[growing]) ** 1.5 / noise[growing]).min()),
-    )  # there the first cell has grown enough
+    low = 0.0
+    high = float(((CELL_GROWTH * now[growing]) ** 1.5 / noise[growing]).min())  # there the first cell has grown enough
     if enough(high):
         for _ in range(40):
             middle = (low + high) / 2
             low, high = (low, middle) if enough(middle) else (middle, high)
-    after = np.minimum(np.ceil(wanted(high) / MULTIPLE - 1e-6) * MULTIPLE, np.maximum(most, now))
+    after = np.minimum(np.ceil(wanted(high) / MULTIPLE - 1e-6) * MULTIPLE, most)
     return after.astype(np.int64)[cell]

@@ -14,7 +14,6 @@ from __future__ import annotations
 import numpy as np
 
 from stages.graphics.denoising import denoise
-from stages.graphics.metrics import log_error
 from stages.graphics.tonemap import log_encode
 from stages.renderformer.records import ViewRecord
 
@@ -43,8 +42,8 @@ class Judge:
         the small network where it meets the target, the large one otherwise, None where nothing is to be denoised."""
         if self.network is None:
             first, second = (log_encode(view.image.astype(np.float64)) for view in (a, b))
-            self.shares = 0.5 * np.abs(first - second).mean(axis=-1)
-            error = 0.5 * log_error(a.image, b.image)
+            difference = 0.5 * np.abs(first - second)
+            error, self.shares = float(difference.mean()), difference.mean(axis=-1)
         elif self.network == "fast":
             error, self.shares = denoised_error(a, b, all_samples, "fast")
             if error <= self.target:

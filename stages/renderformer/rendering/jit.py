@@ -495,11 +495,11 @@ class JitRenderer:
                 else:
                     total = sums.setdefault(name, np.zeros((*value.shape[:-1], rows)))
                     total[..., inside] += np.add.reduceat(value.astype(np.float64), starts, axis=-1)
-        return {name: self._spread(total, len(streams), pixels) for name, total in sums.items()}
+        nothing = {"triangle": -1, "nearest": np.inf}  # of pixels without samples
+        return {name: self._spread(total, len(streams), pixels, nothing.get(name, 0)) for name, total in sums.items()}
 
-    def _spread(self, values: np.ndarray, streams: int, pixels: np.ndarray) -> np.ndarray:
-        """(.., streams x some pixels) -> (streams, all pixels, ..); the others had no samples."""
-        nothing = {np.dtype(np.int32): -1, np.dtype(np.float32): np.inf}.get(values.dtype, 0)
+    def _spread(self, values: np.ndarray, streams: int, pixels: np.ndarray, nothing: float) -> np.ndarray:
+        """(.., streams x some pixels) -> (streams, all pixels, ..), ``nothing`` in the others."""
         rows = np.moveaxis(values, -1, 0).reshape(streams, len(pixels), *values.shape[:-1])
         whole = np.full((streams, self.pixels, *rows.shape[2:]), nothing, values.dtype)
         whole[:, pixels] = rows

@@ -87,11 +87,18 @@ def _sample(renderer: Any, views: Sequence[_Progress], streams: list[int], sampl
     if sampled:
         renderer.learn(indices)
     of_streams = renderer.sample(indices, streams, sampled, step)
-    if renderer.light_paths:
-        windows = [view.allotment.window(sampled + step) for view in views]
-        for stream, of_views in zip(streams, of_streams, strict=True):
-            renderer.add_caustics(of_views, indices, stream, windows)
+    _add_caustics(renderer, views, streams, of_streams, sampled + step)
     return of_streams
+
+
+def _add_caustics(
+    renderer: Any, views: Sequence[_Progress], streams: list[int], of_streams: list[list[Sums]], spp: float
+) -> None:
+    """Add the light paths that are due beside ``spp`` camera paths per pixel in all to the sums per stream and view."""
+    if renderer.light_paths:
+        windows = [view.allotment.window(spp) for view in views]
+        for stream, of_views in zip(streams, of_streams, strict=True):
+            renderer.add_caustics(of_views, [view.index for view in views], stream, windows)
 
 
 def _finish_unevenly(renderer: Any, view: _Progress, streams: list[int], sampled: int, most: int) -> None:
@@ -104,10 +111,7 @@ def _finish_unevenly(renderer: Any, view: _Progress, streams: list[int], sampled
         new = renderer.more(view.index, streams, counts + earlier, after + earlier, place)
         place += -(-int((after - counts).sum()) // counts.size)
         counts = after
-        if renderer.light_paths:
-            window = view.allotment.window(float(counts.mean()))
-            for stream, sums in zip(streams, new, strict=True):
-                renderer.add_caustics([sums], [view.index], stream, [window])
+        _add_caustics(renderer, [view], streams, [[sums] for sums in new], float(counts.mean()))
         view.add(new)
         view.estimate()
         if view.ends():
