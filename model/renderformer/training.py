@@ -29,7 +29,7 @@ from model.renderformer.flops import TRAINING, ideal_seconds, peak_flops
 from model.renderformer.losses import image_loss, log_radiance
 from model.renderformer.network import to_radiance
 from model.renderformer.recipe import FitConfig
-from model.training.gradients import SideBySide
+from model.training.gradients import SideBySide, threads_kept
 from model.training.logs import TrainingLog
 from model.training.optimization import Average, build_optimizers, schedule, set_learning_rate
 from model.training.parallel import Group, accumulating, distribute, gather, scatter
@@ -247,6 +247,7 @@ class Backward:
         return total
 
 
+@threads_kept()
 def fit(
     model: Network,
     config: FitConfig,

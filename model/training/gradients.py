@@ -7,8 +7,9 @@ threads, as long as there are fewer than two for a part.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -16,6 +17,16 @@ from torch import Tensor
 SMALL = 5_000_000  # parameters of a network whose optimizer, too, has operations that are too short to share
 
 Loss = Callable[[], Tensor]  # of a part: a scalar with its graph
+
+
+@contextmanager
+def threads_kept() -> Iterator[None]:
+    """Give torch its number of threads back: what a process trains next rounds as if it were the first."""
+    threads = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 class SideBySide:

@@ -35,7 +35,7 @@ PROBES: Mapping[str, Probe] = {
 class RunProbe(MapStage):
     name = "probe"
     headline = "figure.png"
-    version = 3
+    version = 4
     inputs = ("decimate", "shard", "train")
     Config = Annotated[reduce(lambda a, b: a | b, [probe.Config for probe in PROBES.values()]), Field(discriminator="name")]
     reasons = {

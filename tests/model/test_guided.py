@@ -16,10 +16,10 @@ from model.renderformer import checkpoint
 from model.renderformer.architectures import build, load_config
 from model.renderformer.guided.config import GuideConfig, GuidedConfig
 from model.renderformer.guided.flops import forward_flops
-from model.renderformer.guided.inputs import Scenes, Surface
+from model.renderformer.guided.inputs import Scenes
 from model.renderformer.guided.light import diffuse_light, joint_masking, masking, specular_light, vector_form_factor
 from model.renderformer.guided.network import GuidedNetwork
-from model.renderformer.guided.pixels import Observer, share_lobes
+from model.renderformer.guided.pixels import SHARED, Lobes, Observer, from_bundles, share_lobes, share_lobes_across, to_bundles
 from model.renderformer.guided.triangles import bounce
 from model.renderformer.network import to_radiance
 from model.renderformer.recipe import FitConfig
@@ -238,19 +238,56 @@ def test_lobes_are_shared_by_neighbours_that_see_the_same():
     there = torch.tensor([[1.0, 1, 1, 0]])[..., None]
 
     def shared(roughness: float) -> torch.Tensor:
-        rough = torch.full((1, 4, 1), roughness)
-        surface = Surface(position, normal, normal, radiance, radiance, rough, there)
-        return share_lobes(radiance, position, surface, torch.full((1, 4, 1), 0.5), 4)[0, :, 0]
+        alpha = torch.full((1, 4, 1), roughness**2)
+        return share_lobes(Lobes(radiance, position, normal, alpha, there, SHARED * alpha * 0.5), 4)[0, :, 0]
 
     torch.testing.assert_close(shared(0.6), torch.tensor([2.0, 2.0, 10.0, 7.0]), atol=0.01, rtol=0)
     torch.testing.assert_close(shared(0.01), radiance[0, :, 0])  # a mirror shares nothing
     assert shared(0.6).sum() == pytest.approx(21, abs=0.05)  # no light is made
 
 
+def test_in_whole_views_lobes_are_shared_across_the_edges_of_bundles():
+    """Noise on a rough wall: what is left changes no more across an edge than within a bundle. A mirror shares nothing."""
+    grid, side = (2, 3), 8
+    height, width = 2 * side, 3 * side
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    place = torch.stack([rows, columns, 0 * rows], dim=-1)[None, None] * 1e-4
+    noise = torch.rand(1, 1, height, width, 3, generator=torch.Generator().manual_seed(0))
+
+    def shared(alpha: float, share) -> torch.Tensor:
+        def pixels(values: torch.Tensor) -> torch.Tensor:
+            return to_bundles(values, side).flatten(1, 3)
+
+        ones = torch.ones(1, 1, height, width, 1)
+        up = torch.tensor([0.0, 0, 1]).expand_as(place)
+        lobes = Lobes(*map(pixels, (noise, place, up, alpha * ones, ones, SHARED * alpha * ones)))
+        return from_bundles(share(lobes).unflatten(1, (1, 6, side**2)), height, width, side)[0, 0, ..., 0]
+
+    def steps(image: torch.Tensor) -> tuple[float, float]:
+        """Mean change from column to column: across the edges of bundles, and elsewhere."""
+        change = image.diff(dim=1).abs().mean(dim=0)
+        edge = torch.arange(1, width) % side == 0
+        return float(change[edge].mean()), float(change[~edge].mean())
+
+    across, within = steps(shared(0.3, lambda lobes: share_lobes_across(lobes, side**2, grid)))
+    assert across < 2 * within
+    across, within = steps(shared(0.3, lambda lobes: share_lobes(lobes, side**2)))
+    assert across > 10 * within
+    mirror = shared(1e-5, lambda lobes: share_lobes_across(lobes, side**2, grid))
+    torch.testing.assert_close(mirror, noise[0, 0, ..., 0])
+
+
 @pytest.mark.parametrize("tokens", ["none", "lookup", "encoder"])
 def test_doubled_light_doubles_the_image(tokens):
+    """Before the image is written as a logarithm, which rounds by its own steps."""
     model, data = network(tokens=tokens), guided_batch()
-    once, twice = image(model, data), image(model, {**data, "emission": 2 * data["emission"]})
+
+    def radiance(factor: int) -> torch.Tensor:
+        scenes, pixels, _ = model.arguments({**data, "emission": factor * data["emission"]}, "cpu")
+        with torch.inference_mode():
+            return model.decode(model.encode(scenes), pixels)
+
+    once, twice = radiance(1), radiance(2)
     assert once.max() > 0
     torch.testing.assert_close(twice, 2 * once, rtol=1e-6, atol=1e-6 * float(once.max()))
 
@@ -296,8 +333,9 @@ def test_some_bundles_are_the_same_pixels_as_in_the_whole_view(tokens):
 def test_frames_are_the_views_of_a_batch_in_portions(monkeypatch):
     from model.renderformer.guided import network as module
 
+    """Lobes apart, which frames share across bundles: in portions as at once."""
     model, data = network(), guided_batch(scenes=1)
-    monkeypatch.setattr(module, "AT_ONCE", 600)  # a bundle at a time
+    without_lobes = network(guide=GuideConfig(lobe=False))
     views = [
         {
             name: values[:, [v]]
@@ -307,8 +345,14 @@ def test_frames_are_the_views_of_a_batch_in_portions(monkeypatch):
         | {name: data[name][:, [v]] for name in ("camera_to_world", "fov_deg")}
         for v in range(VIEWS)
     ]
-    frames = [to_radiance(y) for y in model.frames(data, iter(views), (SIDE, SIDE), "cpu")]
-    torch.testing.assert_close(torch.stack(frames), image(model, data)[0], rtol=1e-4, atol=1e-5)
+
+    def frames(network: GuidedNetwork) -> torch.Tensor:
+        return torch.stack([to_radiance(y) for y in network.frames(data, iter(views), (SIDE, SIDE), "cpu")])
+
+    whole = frames(model)
+    monkeypatch.setattr(module, "AT_ONCE", 600)  # a bundle at a time
+    torch.testing.assert_close(frames(model), whole, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(frames(without_lobes), image(without_lobes, data)[0], rtol=1e-4, atol=1e-5)
 
 
 def test_textured_hits_take_their_texel():

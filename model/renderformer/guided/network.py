@@ -24,7 +24,7 @@ from model.renderformer.guided.config import LIGHT_DIM, LIGHT_FEATURES, PIXEL_DI
 from model.renderformer.guided.flops import forward_flops
 from model.renderformer.guided.inputs import SUBSAMPLES, Scenes
 from model.renderformer.guided.light import sum_over_lights
-from model.renderformer.guided.pixels import Known, Observer, Pixels, from_bundles, mean_of_rays
+from model.renderformer.guided.pixels import Known, Lobes, Observer, Pixels, from_bundles, mean_of_rays
 from model.renderformer.guided.triangles import Lit, light_triangles, token_features
 from model.renderformer.layers import LAYER_EPS, DecoderLayer, EncoderLayer, FeedForward, RMSNorm, Rotation
 
@@ -138,7 +138,11 @@ class GuidedNetwork(Network):
         return Scenes.read(batch, device, self.config.guide.bounces)
 
     def forward(self, scenes: Scenes, pixels: Pixels, size: tuple[int, int] | None = None, precision: str = "fp32") -> Tensor:
-        """(B, V, H, W, 3) log10(1 + radiance) of whole views of that size, or (B, V, K, P^2, 3) of some of their bundles."""
+        """(B, V, H, W, 3) log10(1 + radiance) of whole views of that size, or (B, V, K, P^2, 3) of some of their bundles.
+
+        No bundle knows of the others, for a step may have some of a view alone. `frames`, which have whole views, share lobes
+        across them.
+        """
         with autocast(scenes.corners.device.type, precision == "bf16"):
             radiance = self.decode(self.encode(scenes), pixels)
         radiance = radiance.unflatten(1, (pixels.eye.shape[1], pixels.bundles, -1))
@@ -201,7 +205,30 @@ class GuidedNetwork(Network):
 
     def decode(self, encoded: Encoded, pixels: Pixels) -> Tensor:
         """(B, V K P^2, 3) radiance."""
-        known = Observer(encoded.scenes, encoded.lit, self.config.guide).know(pixels)
+        return self._draw(encoded, pixels, Observer(encoded.scenes, encoded.lit, self.config.guide).know(pixels))
+
+    def decode_view(self, encoded: Encoded, pixels: Pixels) -> Tensor:
+        """(1, 1, K, P^2, 3) radiance of one whole view of one scene, in portions; bundles that hit nothing are black."""
+        lights, size = max(1, encoded.scenes.radiance.shape[1]), pixels.size
+        observer = Observer(encoded.scenes, encoded.lit, self.config.guide)
+        radiance = torch.zeros(1, 1, pixels.bundles, size, 3, device=pixels.eye.device)
+        landed = pixels.landed()
+        if not len(landed):
+            return radiance
+        at_once = max(1, AT_ONCE // (lights * SUBSAMPLES * size))
+        portions = [pixels.take(bundles) for bundles in landed.split(at_once)]
+        seen = [observer.see(portion) for portion in portions]
+        lobes, deviation = zip(*map(observer.reflect, portions, seen), strict=True)
+        whole = Lobes.joined(lobes).put(landed, pixels.bundles, size)
+        reflected = observer.share(whole, size, pixels.grid).unflatten(1, (-1, size))[:, landed]
+        parts = zip(landed.split(at_once), portions, seen, reflected.split(at_once, dim=1), deviation, strict=True)
+        for bundles, portion, of_portion, shared, apart in parts:
+            known = observer.conclude(portion, of_portion, shared.flatten(1, 2), apart)
+            radiance[0, 0, bundles] = self._draw(encoded, portion, known).view(len(bundles), size, 3)
+        return radiance
+
+    def _draw(self, encoded: Encoded, pixels: Pixels, known: Known) -> Tensor:
+        """The pixels (B, M, 3) of which that is known."""
         features = [known.features]
         if encoded.tokens is not None:
             tokens = encoded.tokens.float()
@@ -213,15 +240,6 @@ class GuidedNetwork(Network):
             features.append(self._gather(encoded, pixels, known))
         outputs, corrections = self.head(torch.cat(features, dim=-1), known.lights)
         return self._compose(encoded.scenes, known, outputs.float(), corrections)
-
-    def decode_view(self, encoded: Encoded, pixels: Pixels) -> Tensor:
-        """(1, 1, K, P^2, 3) radiance of one view of one scene, in portions; bundles that hit nothing are black."""
-        lights, size = max(1, encoded.scenes.radiance.shape[1]), pixels.size
-        radiance = torch.zeros(1, 1, pixels.bundles, size, 3, device=pixels.eye.device)
-        landed = pixels.landed()
-        for bundles in landed.split(max(1, AT_ONCE // (lights * SUBSAMPLES * size))) if len(landed) else ():
-            radiance[0, 0, bundles] = self.decode(encoded, pixels.take(bundles)).view(len(bundles), size, 3)
-        return radiance
 
     def _gather(self, encoded: Encoded, pixels: Pixels, known: Known) -> Tensor:
         """(B, M, d): what each pixel's bundle gathers from the tokens, by attention at the mean position that it hits."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from torch import Tensor
 from model.renderformer.guided.config import GuideConfig
 from model.renderformer.guided.inputs import SUBSAMPLES, Hits, Scenes, Surface
 from model.renderformer.guided.light import (
+    TINY,
     diffuse_light,
     dot,
     joint_masking,
@@ -25,6 +27,7 @@ from model.renderformer.guided.light import (
 from model.renderformer.guided.triangles import Lit, encode_position
 
 SHARED = 0.7  # of a lobe's width: how far apart pixels are that share what their lobes see
+LEAST = 1e-6  # a pixel's own share where it shares with none
 GUIDES = ("hit", "hit_weights", "main", "mirror", "mirror_weights", "lobe", "lobe_weights", "light_seen")
 
 
@@ -33,7 +36,7 @@ class Pixels:
     """Some pixels of the views of B scenes, by ray bundles: B x (V K) bundles of P^2 pixels of 4 rays.
 
     eye: (B, V, 3). hit, mirror, lobe: rays (B, V K P^2 4), (B, V K P^2), (B, V K P^2 4). main: (B, V K P^2), the ray of each
-    pixel that its mirror reflection starts from. seen: (B, V K P^2 4, L).
+    pixel that its mirror reflection starts from. seen: (B, V K P^2 4, L). grid: bundles down and across of whole views.
     """
 
     eye: Tensor
@@ -44,18 +47,21 @@ class Pixels:
     seen: Tensor
     bundles: int  # of a view
     bundle: int
+    grid: tuple[int, int] | None = None
 
     @classmethod
     def read(cls, batch: Mapping[str, Any], scenes: Scenes, bundle: int) -> Pixels:
         device = scenes.corners.device
         arrays = {name: np.asarray(batch[f"guide_{name}"]) for name in GUIDES}
+        grid = None
         if "bundles" not in batch:
+            grid = tuple(side // bundle for side in arrays["hit"].shape[2:4])
             arrays = {name: to_bundles(array, bundle) for name, array in arrays.items()}
         hits = {name: Hits.read(arrays[name], arrays[f"{name}_weights"], scenes) for name in ("hit", "mirror", "lobe")}
         seen = torch.from_numpy(np.ascontiguousarray(arrays["light_seen"])).to(device).float()
         eye = torch.from_numpy(np.ascontiguousarray(batch["camera_to_world"][:, :, :3, 3])).to(device).float()
         main = torch.from_numpy(np.ascontiguousarray(arrays["main"])).to(device).long().clamp(min=0).flatten(1)
-        return cls(eye, **hits, main=main, seen=seen.flatten(1, -2), bundles=arrays["hit"].shape[2], bundle=bundle)
+        return cls(eye, **hits, main=main, seen=seen.flatten(1, -2), bundles=arrays["hit"].shape[2], bundle=bundle, grid=grid)
 
     @property
     def size(self) -> int:
@@ -79,8 +85,8 @@ class Pixels:
         return Pixels(self.eye, **hits, main=some(self.main), seen=some(self.seen), bundles=len(bundles), bundle=self.bundle)
 
 
-def to_bundles(pixels: np.ndarray, side: int) -> np.ndarray:
-    """(B, V, H, W, ...) -> (B, V, K, side^2, ...), bundles row by row."""
+def to_bundles(pixels: Any, side: int) -> Any:
+    """(B, V, H, W, ...) -> (B, V, K, side^2, ...), bundles row by row; an array or a tensor."""
     batch, views, height, width, *rest = pixels.shape
     grid = pixels.reshape(batch, views, height // side, side, width // side, side, *rest).swapaxes(3, 4)
     return grid.reshape(batch, views, -1, side * side, *rest)
@@ -125,6 +131,69 @@ class Reflected:
 
 
 @dataclass
+class Seen:
+    """What M pixels see, of B scenes. rays: by each of their rays, M 4; means: over those that hit something; main, surface: by
+    the main ray, and mirror: what it hits next. coverage: (B, M, 1)."""
+
+    rays: Surface
+    main: Hits
+    surface: Surface
+    mirror: Reflected
+    means: Surface
+    coverage: Tensor
+
+
+@dataclass
+class Lobes:
+    """Radiance that white lobes of surfaces return, and which surfaces they are: (..., C), by pixels.
+
+    radiance: C = 3, of the pixel's own rays. position, normal: C = 3. alpha, there: C = 1. reach: C = 1, how far from one
+    another pixels see nearly the same.
+    """
+
+    radiance: Tensor
+    position: Tensor
+    normal: Tensor
+    alpha: Tensor
+    there: Tensor
+    reach: Tensor
+
+    @classmethod
+    def joined(cls, portions: Sequence[Lobes]) -> Lobes:
+        """One after the other, along dimension 1."""
+        return cls(**{name: torch.cat([getattr(portion, name) for portion in portions], dim=1) for name in LOBES})
+
+    def put(self, bundles: Tensor, of: int, size: int) -> Lobes:
+        """These are ``bundles`` of one view of one scene, which has so many of that size. The others hit nothing."""
+
+        def whole(name: str) -> Tensor:
+            values = getattr(self, name).unflatten(1, (-1, size))
+            everything = values.new_full((1, of, size, values.shape[-1]), float(name != "there"))
+            everything[:, bundles] = values
+            return everything.flatten(1, 2)
+
+        return Lobes(**{name: whole(name) for name in LOBES})
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Lobes:
+        return Lobes(**{name: change(getattr(self, name)) for name in LOBES})
+
+    def likeness(self, other: Lobes) -> Tensor:
+        """(..., 1): how far these lobes see what others see.
+
+        Pixels share where they are nearer to one another than the lobe is wide at the distance of what it sees, and their
+        normals differ by less than the lobe is wide. So a mirror shares nothing.
+        """
+        width = SHARED * self.alpha
+        apart = _squared(self.position - other.position) / self.reach.square()
+        apart = apart + _squared(self.normal - other.normal) / width.square()
+        alike = (self.alpha / other.alpha - 1).abs() < 0.1
+        return torch.exp(-apart / 2) * alike * self.there * other.there
+
+
+LOBES = tuple(field.name for field in fields(Lobes))
+
+
+@dataclass
 class Known:
     """What needs no weights, of B x M pixels and their M 4 rays.
 
@@ -154,18 +223,55 @@ class Observer:
     guide: GuideConfig
 
     @torch.no_grad()
-    def know(self, pixels: Pixels) -> Known:
-        """All that needs no weights."""
+    def see(self, pixels: Pixels) -> Seen:
         eye = pixels.eye.repeat_interleave(pixels.bundles * pixels.size, dim=1)  # (B, M, 3)
         rays = Surface.at(pixels.hit, self.scenes, eye.repeat_interleave(SUBSAMPLES, dim=1))
-        direct = self._direct(pixels, rays)
         main, surface = _main(pixels, rays)
         mirror = self._reflected(surface, pixels.mirror)
         coverage = mean_of_rays(rays.there, 1)
         means = Surface(
             **{name: mean_of_rays(value, 1) / coverage.clamp(min=1 / SUBSAMPLES) for name, value in vars(rays).items()}
         )
-        reflected, deviation = self._reflections(pixels, rays, means, mirror, surface)
+        return Seen(rays, main, surface, mirror, means, coverage)
+
+    @torch.no_grad()
+    def reflect(self, pixels: Pixels, seen: Seen) -> tuple[Lobes, Tensor]:
+        """What white lobes return of what reflections hit, without lights; and (B, M, 3), how far a pixel's rays are apart.
+
+        Without that guide, what the mirror reflection returns, where that is given.
+        """
+        surface, distance = seen.surface, seen.mirror.distance
+        none = torch.zeros_like(seen.means.position)
+        radiance, deviation = (seen.mirror.image if self.guide.mirror else none), none
+        if self.guide.lobe:
+            lobe = self._reflected(seen.rays, pixels.lobe).image
+            radiance, deviation = per_pixel(lobe, seen.rays), _deviation(lobe)
+        alpha = surface.alpha[..., None]
+        reach = (SHARED * alpha * torch.where(distance > 0, distance, 1.0)).clamp(min=1e-5)
+        return Lobes(radiance, seen.means.position, surface.normal, alpha, surface.there, reach), deviation
+
+    def share(self, lobes: Lobes, size: int, grid: tuple[int, int] | None = None) -> Tensor:
+        """(B, M, 3): reflected radiance, averaged over neighbours as far as their lobes see the same.
+
+        Few rays of a wide lobe are noise; the neighbours' rays are more of them. size: pixels of a bundle. grid: bundles down
+        and across of whole views. None: the neighbours that are there are those in the same bundle.
+        """
+        if not self.guide.lobe:
+            return lobes.radiance
+        return share_lobes(lobes, size) if grid is None else share_lobes_across(lobes, size, grid)
+
+    @torch.no_grad()
+    def know(self, pixels: Pixels) -> Known:
+        """All that needs no weights. Bundles share lobes with no others, as if each were alone."""
+        seen = self.see(pixels)
+        lobes, deviation = self.reflect(pixels, seen)
+        return self.conclude(pixels, seen, self.share(lobes, pixels.size), deviation)
+
+    @torch.no_grad()
+    def conclude(self, pixels: Pixels, seen: Seen, reflected: Tensor, deviation: Tensor) -> Known:
+        """What is known of pixels whose reflections, (B, M, 3) radiance and how far a pixel's rays are apart, are known."""
+        rays, surface, means, coverage, main = seen.rays, seen.surface, seen.means, seen.coverage, seen.main
+        direct = self._direct(pixels, rays)
         bounced = self._bounced(pixels.hit, rays.to_eye)
         features = [
             encode_position(means.position),
@@ -180,7 +286,7 @@ class Observer:
             coverage,
             main.weights * main.there,
             *self._light_sums(direct, coverage),
-            *self._mirror_features(mirror, surface),
+            *self._mirror_features(seen.mirror, surface),
             torch.log1p(reflected) * float(self.guide.lobe),
             torch.log1p(deviation),
         ]
@@ -236,18 +342,6 @@ class Observer:
             shape = shape * hits.between_points(self.scenes.seen)
         return sum_over_lights(shape, self.scenes.radiance)
 
-    def _reflections(
-        self, pixels: Pixels, rays: Surface, means: Surface, mirror: Reflected, surface: Surface
-    ) -> tuple[Tensor, Tensor]:
-        """(B, M, 3) twice: radiance that a white lobe returns of what reflections hit, the lights left out; and how far apart
-        the rays of the pixel are in it."""
-        none = torch.zeros_like(means.position)
-        if not self.guide.lobe:
-            return (mirror.image if self.guide.mirror else none), none
-        lobe = self._reflected(rays, pixels.lobe).image
-        mean = per_pixel(lobe, rays)
-        return share_lobes(mean, means.position, surface, mirror.distance, pixels.size), _deviation(lobe)
-
     def _light_sums(self, direct: Direct, coverage: Tensor) -> list[Tensor]:
         """Of each pixel the closed forms of all lights together, diffuse and specular: open, and as far as lights are seen."""
         parts = (direct.diffuse, direct.specular, direct.diffuse * direct.seen, direct.specular * direct.seen)
@@ -283,34 +377,42 @@ def mean_of_rays(values: Tensor, dim: int) -> Tensor:
     return values.unflatten(dim, (-1, SUBSAMPLES)).mean(dim=dim + 1)
 
 
-def share_lobes(radiance: Tensor, position: Tensor, surface: Surface, distance: Tensor, size: int) -> Tensor:
-    """(B, M, 3): reflected radiance, averaged over the pixels of a bundle as far as their lobes see the same.
-
-    Few rays of a wide lobe are noise; the neighbours' rays are more of them. Two pixels share where they are nearer to one
-    another than the lobe is wide at the distance of what it sees, and their normals differ by less than the lobe is wide. So a
-    mirror shares nothing. ``size``: pixels of a bundle.
-    """
-
-    def bundles(values: Tensor) -> Tensor:
-        return values.unflatten(1, (-1, size))  # (B, bundles, size, C)
-
-    alpha = surface.alpha[..., None]
-    there = bundles(surface.there)
-    reach = bundles(SHARED * alpha * torch.where(distance > 0, distance, 1.0)).clamp(min=1e-5)
-    width = bundles(SHARED * alpha)
-    apart = (
-        _squared_distances(bundles(position)) / reach.square() + _squared_distances(bundles(surface.normal)) / width.square()
-    )
-    ratio = bundles(alpha) / bundles(alpha).transpose(-1, -2)
-    alike = (ratio - 1).abs() < 0.1
-    weight = torch.exp(-apart / 2) * alike * there * there.transpose(-1, -2)
-    weight = weight + torch.eye(size, device=weight.device) * 1e-6
-    return (weight @ bundles(radiance) / weight.sum(dim=-1, keepdim=True)).flatten(1, 2)
+def share_lobes(lobes: Lobes, size: int) -> Tensor:
+    """(B, M, 3): radiance, averaged over the pixels of a bundle as far as their lobes see the same. ``size``: those pixels."""
+    bundles = lobes.map(lambda values: values.unflatten(1, (-1, size)))  # (B, bundles, size, C)
+    one, other = bundles.map(lambda values: values[:, :, :, None]), bundles.map(lambda values: values[:, :, None])
+    weight = one.likeness(other)[..., 0]
+    weight = weight + torch.eye(size, device=weight.device) * LEAST
+    return (weight @ bundles.radiance / weight.sum(dim=-1, keepdim=True)).flatten(1, 2)
 
 
-def _squared_distances(points: Tensor) -> Tensor:
-    """(..., N, C) -> (..., N, N)."""
-    return (points[..., :, None, :] - points[..., None, :, :]).square().sum(dim=-1)
+def share_lobes_across(lobes: Lobes, size: int, grid: tuple[int, int]) -> Tensor:
+    """(B, M, 3): the same, over the neighbours up to half a bundle away, whatever the bundle. ``grid``: bundles down and across
+    of whole views."""
+    side = math.isqrt(size)
+    height, width = (side * bundles for bundles in grid)
+
+    def image(values: Tensor) -> Tensor:
+        return from_bundles(values.unflatten(1, (-1, grid[0] * grid[1], size)), height, width, side).flatten(0, 1)
+
+    views = lobes.map(image)  # (B V, H, W, C)
+    far = side // 2
+    around = views.map(lambda values: F.pad(values, (0, 0, far, far, far, far)))
+    around.alpha.clamp_(min=TINY)
+    total, weights = LEAST * views.radiance, LEAST
+    for down in range(2 * far + 1):
+        for right in range(2 * far + 1):
+            other = around.map(lambda values, y=down, x=right: values[:, y : y + height, x : x + width])
+            weight = views.likeness(other)
+            total, weights = total + weight * other.radiance, weights + weight
+    shared = (total / weights).unflatten(0, (len(lobes.radiance), -1))
+    return to_bundles(shared, side).flatten(1, 3)
+
+
+def _squared(difference: Tensor) -> Tensor:
+    """(..., 3) -> (..., 1), its squared length; several times as fast as a sum over so short a dimension."""
+    x, y, z = difference.square().unbind(dim=-1)
+    return (x + y + z)[..., None]
 
 
 def per_pixel(values: Tensor, rays: Surface) -> Tensor:

@@ -16,7 +16,7 @@ from pipeline.store import history, store_of
 if TYPE_CHECKING:
     from pipeline.store import Artifact, Draft
 
-VERSION = 5  # of stage evaluate: what the artifacts that are read here hold
+VERSION = 6  # of stage evaluate: what the artifacts that are read here hold
 PROBE_FIELDS = ("name", "title", "question", "setting", "model", "columns", "rows", "notes")  # of probe.json
 CONFIGS = ("collect", "scene", "render", "train", "evaluate")  # stages whose settings the page shows
 
@@ -104,7 +104,7 @@ def load_run(artifact: Artifact, name: str) -> Run:
     if preimage["version"] != VERSION:
         raise UserError(
             f"{artifact.path.name} was made by version {preimage['version']} of evaluate, and this is version "
-            f"{VERSION}, which holds more: evaluate the model again (stage=evaluate)"
+            f"{VERSION}: evaluate the model again (stage=evaluate)"
         )
     timing = artifact.path / "files" / "timing.json"
     return run_of(
