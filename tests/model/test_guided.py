@@ -19,7 +19,16 @@ from model.renderformer.guided.flops import forward_flops
 from model.renderformer.guided.inputs import Scenes
 from model.renderformer.guided.light import diffuse_light, joint_masking, masking, specular_light, vector_form_factor
 from model.renderformer.guided.network import GuidedNetwork
-from model.renderformer.guided.pixels import SHARED, Lobes, Observer, from_bundles, share_lobes, share_lobes_across, to_bundles
+from model.renderformer.guided.pixels import (
+    SHARED,
+    Lobes,
+    Observer,
+    from_bundles,
+    share_lobes,
+    share_lobes_across,
+    to_bundles,
+    without_dots,
+)
 from model.renderformer.guided.triangles import bounce
 from model.renderformer.network import to_radiance
 from model.renderformer.recipe import FitConfig
@@ -274,7 +283,25 @@ def test_in_whole_views_lobes_are_shared_across_the_edges_of_bundles():
     across, within = steps(shared(0.3, lambda lobes: share_lobes(lobes, side**2)))
     assert across > 10 * within
     mirror = shared(1e-5, lambda lobes: share_lobes_across(lobes, side**2, grid))
-    torch.testing.assert_close(mirror, noise[0, 0, ..., 0])
+    torch.testing.assert_close(mirror, without_dots(noise[0], torch.ones(1, height, width, 1))[0, ..., 0])
+
+
+def test_dots_are_what_one_pixel_alone_shows():
+    image, there = torch.ones(1, 7, 9, 3), torch.ones(1, 7, 9, 1)
+    image[0, 2, 2] = 50  # alone
+    image[0, 0, 8] = 50  # alone, in a corner
+    image[0, 4, 4:7] = torch.tensor([20.0, 30, 40])[:, None]  # a line keeps its middle
+    image[0, 6, 1] = 0.1
+    expected = image.clone()
+    expected[0, 2, 2] = expected[0, 0, 8] = 1
+    expected[0, 4, 4:7] = torch.tensor([1.0, 20, 1])[:, None]
+    torch.testing.assert_close(without_dots(image, there), expected)
+    image[0, 3:, :] = 9
+    there[0, 3:] = 0  # what hits nothing limits nobody
+    thin = torch.zeros_like(there)
+    thin[0, 2, 2:4] = 1
+    assert without_dots(image, there)[0, 2, 2, 0] == 1
+    assert without_dots(image, thin)[0, 2, 2, 0] == 50  # a pixel that has but one neighbour stays
 
 
 @pytest.mark.parametrize("tokens", ["none", "lookup", "encoder"])

@@ -405,8 +405,23 @@ def share_lobes_across(lobes: Lobes, size: int, grid: tuple[int, int]) -> Tensor
             other = around.map(lambda values, y=down, x=right: values[:, y : y + height, x : x + width])
             weight = views.likeness(other)
             total, weights = total + weight * other.radiance, weights + weight
-    shared = (total / weights).unflatten(0, (len(lobes.radiance), -1))
+    shared = without_dots(total / weights, views.there).unflatten(0, (len(lobes.radiance), -1))
     return to_bundles(shared, side).flatten(1, 3)
+
+
+def without_dots(images: Tensor, there: Tensor) -> Tensor:
+    """(B, H, W, C): no pixel is brighter than the second brightest of the eight around it: one that is shows what a single ray
+    found by chance. There are (B, H, W, 1): pixels that count; one that has not two such neighbours stays."""
+    height, width = images.shape[1:3]
+    padded = F.pad(torch.where(there > 0, images, -1.0), (0, 0, 1, 1, 1, 1), value=-1.0)
+    first = second = torch.full_like(images, -1.0)
+    for down in range(3):
+        for right in range(3):
+            if (down, right) != (1, 1):
+                other = padded[:, down : down + height, right : right + width]
+                second = torch.maximum(second, torch.minimum(first, other))
+                first = torch.maximum(first, other)
+    return torch.where(second < 0, images, torch.minimum(images, second))
 
 
 def _squared(difference: Tensor) -> Tensor:
