@@ -62,6 +62,12 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
 
 
+def _threads() -> int | None:
+    """What the engine has set in worker processes."""
+    threads = os.environ.get("LIGHTMILL_THREADS")
+    return int(threads) if threads else None
+
+
 @dataclass
 class Worker:
     """The scenes, the network and the path tracer, one set per process; the latter two are loaded when first used."""
@@ -70,6 +76,7 @@ class Worker:
     inputs: Inputs
     renderer: dict[str, Any]  # a backend that ``stages.graphics.mitsuba.backend`` chose
     device: str = "cpu"
+    threads: int | None = field(default_factory=_threads)  # of the path tracer; None: all cores
 
     @cached_property
     def _loaded(self) -> tuple[Any, dict[str, str]]:
@@ -114,8 +121,7 @@ class Worker:
 
         config, seed = self.config, seed_for(self.config.seed, "probe/trace", scene.id)
         settings = replace(RenderSettings(config.resolution, config.max_spp, seed, config.target_error), **changes)
-        threads = os.environ.get("LIGHTMILL_THREADS")  # set by the engine in worker processes
-        return render_views(scene, settings, self.renderer, [0], int(threads) if threads else None)[0]
+        return render_views(scene, settings, self.renderer, [0], self.threads)[0]
 
     def rng(self, purpose: str, scene_id: str) -> np.random.Generator:
         """Random numbers of a scene, the same for every value of the setting."""

@@ -40,12 +40,13 @@ if TYPE_CHECKING:
     from pipeline.store import Draft
 
 
-def use_threads(threads: int | None) -> int:
-    """Let the network use so many CPU threads (None: all cores), in this process from here on."""
+def use_threads(worker: Worker, threads: int | None) -> int:
+    """Let network and path tracer use so many CPU threads (None: all cores), in this process from here on."""
     import torch
 
     torch.set_num_threads(threads or os.cpu_count() or 1)
-    return torch.get_num_threads()
+    worker.threads = torch.get_num_threads()
+    return worker.threads
 
 
 def traced_picture(worker: Worker, scene: SceneRecord, spp: int, denoised: bool, **options: Any) -> np.ndarray:
@@ -58,7 +59,7 @@ def traced_picture(worker: Worker, scene: SceneRecord, spp: int, denoised: bool,
 
 def machine(worker: Worker, threads: int) -> str:
     """Where times were taken, and whether the machine had other things to do."""
-    text = f"network on {worker.device} with {threads} thread(s), path tracer on {worker.renderer['backend']}"
+    text = f"network on {worker.device} and path tracer on {worker.renderer['backend']} with {threads} CPU thread(s)"
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     return text + (f" (the machine was busy, load {load:.1f} on {cores} cores: times too long)" if load > 1.5 * cores else "")
 
@@ -74,7 +75,7 @@ class TimingConfig(ProbeConfig):
     frames: int = count(8, ge=1)  # of an animation of a static scene
     tracer_spp: int = count(64, ge=0)  # of the path tracer beside it, denoised; 0: without
     repeats: int = count(3, ge=1)
-    threads: int | None = count(None, ge=1)  # of the network; null: all cores
+    threads: int | None = count(None, ge=1)  # of network and path tracer; null: all cores
 
     _values = field_validator("values")(at_least(1, 65536, whole=True))
 
@@ -115,7 +116,7 @@ class Timing(Probe):
         from stages.renderformer.probes.figures import COLOURS, new_figure, plain
 
         config = worker.config
-        threads = use_threads(config.threads)
+        threads = use_threads(worker, config.threads)
         measured: dict[int, list[dict[str, float]]] = {}
         for row in draft.rows():
             facts = unpack_json(draft.read(row.id, ("metrics.json",)).members["metrics.json"])
@@ -193,7 +194,7 @@ class EqualTimeConfig(ProbeConfig):
     name: Literal["equal_time"] = "equal_time"
     values: tuple[float, ...] = (1, 2, 4, 8, 16, 32, 64)  # samples per pixel; all in one record
     repeats: int = count(3, ge=1)
-    threads: int | None = count(None, ge=1)  # of the network; null: all cores
+    threads: int | None = count(None, ge=1)  # of network and path tracer; null: all cores
 
     _values = field_validator("values")(at_least(1, 65536, whole=True))
 
@@ -249,7 +250,7 @@ class EqualTime(Probe):
         from stages.renderformer.probes.figures import COLOURS, LEAST_WIDTH, new_figure, plain, strip
 
         config = worker.config
-        threads = use_threads(config.threads)
+        threads = use_threads(worker, config.threads)
         ids = [row.id for row in draft.rows()]
         facts = [unpack_json(draft.read(id, ("metrics.json",)).members["metrics.json"]) for id in ids]
         scene = worker.base(ids[0])
