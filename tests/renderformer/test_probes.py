@@ -54,7 +54,17 @@ def inputs(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def guided(inputs, tmp_path_factory):
-    """The same with a guided network."""
+    """The same with a guided network that has all kinds of tokens."""
+    return with_guided(inputs, tmp_path_factory.mktemp("guided") / "train", "encoder")
+
+
+@pytest.fixture(scope="module")
+def pixels_alone(inputs, tmp_path_factory):
+    """The same with a guided network as the default has it."""
+    return with_guided(inputs, tmp_path_factory.mktemp("pixels") / "train", "none")
+
+
+def with_guided(inputs, folder, tokens):
     import torch
 
     from model.renderformer import checkpoint
@@ -62,8 +72,8 @@ def guided(inputs, tmp_path_factory):
     from model.renderformer.guided.network import GuidedNetwork
 
     torch.manual_seed(0)
-    model = GuidedNetwork(GuidedConfig(token_dim=24, token_layers=1, token_heads=1, head_dim=16, head_layers=1))
-    train = FakeArtifact(tmp_path_factory.mktemp("guided") / "train", [])
+    model = GuidedNetwork(GuidedConfig(tokens=tokens, token_dim=24, token_layers=1, token_heads=1, head_dim=16, head_layers=1))
+    train = FakeArtifact(folder, [])
     train.key = "1" * 64
     checkpoint.save(model.config, model.state_dict(), train.files / "checkpoint", {"triangles": "768", "resolution": "16"})
     return {**inputs, "train": train}
@@ -343,7 +353,18 @@ def test_a_guided_model_is_probed_as_well(name, guided, tmp_path):
         assert any("casting hits" in column for column in probe_json["columns"])
 
 
-def test_a_probe_that_says_nothing_of_a_network_is_refused(guided, tmp_path):
+@pytest.mark.parametrize("name", ["equal_time", "timing"])
+def test_times_of_a_model_without_tokens(name, pixels_alone, tmp_path):
+    draft = run(pixels_alone, tmp_path / "probe", name=name, **(TINY | CHEAP[name]))
+    rows, columns = (json.loads((draft.files / "probe.json").read_text())[part] for part in ("rows", "columns"))
+    assert rows
+    if name == "timing":
+        assert {float(row[columns.index("GFLOP, view-independent")]) for row in rows} == {0.0}
+
+
+def test_a_probe_that_says_nothing_of_a_network_is_refused(guided, pixels_alone, tmp_path):
+    with pytest.raises(UserError, match="probe=attention: ray bundles of this model look at no triangles"):
+        run(pixels_alone, tmp_path / "attention", name="attention", **(TINY | CHEAP["attention"]))
     with pytest.raises(UserError, match="probe=tokens: a guided model is given each triangle's light"):
         run(guided, tmp_path / "probe", name="tokens", **TINY)
 

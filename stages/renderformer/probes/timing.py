@@ -104,7 +104,7 @@ class Timing(Probe):
         config, scene = worker.config, self._scene(worker, item.id)
         network = worker.model.config
         flops = architecture_of(network).flops(network, [len(scene.triangles)], 1, config.resolution, config.resolution)
-        independent = sum(flops[name] for name in ENCODER_PARTS)
+        independent = sum(flops.get(name, 0.0) for name in ENCODER_PARTS)  # a network without tokens has none
         facts = {
             "triangles": len(scene.triangles),
             "flops": {"view_independent": independent, "view_dependent": sum(flops.values()) - independent},
