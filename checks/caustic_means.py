@@ -20,7 +20,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from bench.caustics import NAMES, scenes  # noqa: E402
+from bench.caustics import NAMES  # noqa: E402
+from bench.caustics import scene as caustic_scene
 from stages.graphics.exr import read_rgb  # noqa: E402
 from stages.graphics.mitsuba.backend import choose  # noqa: E402
 from stages.renderformer.records import SceneRecord  # noqa: E402
@@ -87,7 +88,7 @@ def main() -> int:
     print("| view | plain: camera paths | light paths too | Cycles | clamped: camera paths | light paths too | Cycles |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
     for view in arguments.views:
-        scene, side = scenes()[view], arguments.resolution
+        scene, side = caustic_scene(view), arguments.resolution
         camera, both = (
             Means(ours(scene, side, arguments.spp, light_paths, backend, arguments.threads)) for light_paths in (False, True)
         )

@@ -216,12 +216,13 @@ class GuidedNetwork(Network):
         if not len(landed):
             return radiance
         at_once = max(1, AT_ONCE // (lights * SUBSAMPLES * size))
-        portions = [pixels.take(bundles) for bundles in landed.split(at_once)]
+        chosen = landed.split(at_once)
+        portions = [pixels.take(bundles) for bundles in chosen]
         seen = [observer.see(portion) for portion in portions]
         lobes, deviation = zip(*map(observer.reflect, portions, seen), strict=True)
         whole = Lobes.joined(lobes).put(landed, pixels.bundles, size)
         reflected = observer.share(whole, size, pixels.grid).unflatten(1, (-1, size))[:, landed]
-        parts = zip(landed.split(at_once), portions, seen, reflected.split(at_once, dim=1), deviation, strict=True)
+        parts = zip(chosen, portions, seen, reflected.split(at_once, dim=1), deviation, strict=True)
         for bundles, portion, of_portion, shared, apart in parts:
             known = observer.conclude(portion, of_portion, shared.flatten(1, 2), apart)
             radiance[0, 0, bundles] = self._draw(encoded, portion, known).view(len(bundles), size, 3)
