@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from bench.caustics import NAMES  # noqa: E402
-from bench.caustics import scene as caustic_scene
+from bench.caustics import scene as caustic_scene  # noqa: E402
 from stages.graphics.exr import read_rgb  # noqa: E402
 from stages.graphics.mitsuba.backend import choose  # noqa: E402
 from stages.renderformer.records import SceneRecord  # noqa: E402
