@@ -2,6 +2,7 @@
 
 Reads fit's maps and networks, atlas' mesh and capture's frames; writes ``site/``, a folder that is a complete web site
 and holds what another engine needs (``stages.neuras.baking.site`` lists it). One template makes the shaders of both.
+With ``residuals`` it draws what training photos know beyond the textures, too (``stages.neuras.baking.residuals``).
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from pipeline.store import Draft
 
 
+SOFT_M = 0.05  # metres within which the nearest photos weigh alike
+
+
 class BakeConfig(StageConfig):
     """Lengths end in ``_m``: metres, or nominal metres where the capture's unit is unknown (``CaptureInfo.metre``)."""
 
@@ -26,12 +30,14 @@ class BakeConfig(StageConfig):
     frames: int = Field(60, ge=1)  # at most so many photos on the page, spread over the capture
     largest: int = Field(8192, ge=256)  # texels along a side that devices are expected to take
     tile_m: float | None = added(None, legacy=None, gt=0)  # side of tiles that the page loads as one drives; None: one piece
+    residuals: int = added(4, legacy=0, ge=0)  # nearest training photos whose residuals a view adds; 0: none
+    residual_angle: float = added(5.0, legacy=5.0, gt=0, lt=90)  # degrees between two rays at which a residual has faded to 1/e
     reach_m: float = added(200.0, legacy=200.0, gt=0)  # how far from the camera it loads them
 
 
 class Bake(RunStage):
     name: ClassVar[str] = "bake"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas", "fit")
     Config: ClassVar[Any] = BakeConfig
     headline: ClassVar[str | None] = "site/index.html"
@@ -40,10 +46,14 @@ class Bake(RunStage):
         return config.textures
 
     def run(self, config: BakeConfig, inputs: Inputs, draft: Draft) -> list[str]:
+        import torch
+
         from model.neuras.baked import Baked
         from stages.neuras.baking import site
         from stages.neuras.baking.drawing import depth_range
+        from stages.neuras.baking.residuals import Residuals
         from stages.neuras.baking.tiles import Tiling, cut
+        from stages.neuras.evaluation.renderers import Reference
         from stages.neuras.records import CaptureInfo, fitted_poses, frames, load_atlas, posed
 
         capture = inputs["capture"]
@@ -62,7 +72,21 @@ class Bake(RunStage):
         if config.tile_m is not None:
             tiling = Tiling(config.tile_m * info.metre, config.reach_m * info.metre, config.largest)
             tiles = cut(atlas, baked.pyramid, info.up, [view.camera for view in shown], tiling)
-        planes = depth_range(atlas.vertices, info.metre)
-        sizes = site.write_site(draft.files / "site", baked, atlas, info, shown, planes, config.textures, tiles)
+        planes, folder = depth_range(atlas.vertices, info.metre), draft.files / "site"
+        photos = None
+        if config.residuals:
+            torch.set_num_threads(1)  # sums in another order round differently
+            photos = Residuals.make(
+                folder,
+                Reference(baked, atlas),
+                (view for view in views if view.split == "train"),
+                baked.sky_centre,
+                planes,
+                SOFT_M * info.metre,
+                config.residuals,
+                config.residual_angle,
+                inputs["fit"].manifest["config"].get("exposure", False),
+            )
+        sizes = site.write_site(folder, baked, atlas, info, shown, planes, config.textures, tiles, photos)
         draft.note("summary", {"megabytes": {kind: round(size / 1e6, 3) for kind, size in sizes.items()}})
         return sorted(path.relative_to(draft.files).as_posix() for path in draft.files.rglob("*") if path.is_file())

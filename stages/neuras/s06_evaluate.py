@@ -1,9 +1,9 @@
 """Stage evaluate: how well a fitted scene shows what it was not fitted to, against multi-view warping (section 4).
 
 Reads capture's held-out and shifted frames, and atlas, fit and bake. Writes one record per frame: the photo, ours by torch,
-ours by the baked shader where OpenGL is, warping, the difference, and ``metrics.json``. ``files/`` gets report.html,
-metrics.json, timing.json, and videos along the drive and through a lane change. Times are never the same twice, so they
-stay out of the records and of metrics.json.
+with and without residuals, ours by the baked shader where OpenGL is, warping, the difference, and ``metrics.json``. ``files/``
+gets report.html, metrics.json, timing.json, and videos along the drive and through a lane change. Times are never the same
+twice, so they stay out of the records and of metrics.json.
 """
 
 from __future__ import annotations
@@ -92,6 +92,8 @@ class Evaluate(MapStage):
         return (Item(row.id, row.group) for row in rows)
 
     def open(self, config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any]) -> tuple[Examiner, Photos]:
+        from dataclasses import replace
+
         import torch
 
         from stages.neuras.evaluation.renderers import Scene
@@ -104,6 +106,7 @@ class Evaluate(MapStage):
         photos = Photos(capture, inputs["fit"])
         examiner = Examiner(
             reference,
+            None if scene.residuals is None else replace(scene, residuals=None).reference(),
             {} if environment["opengl"] is None else {kind: scene.drawing(kind) for kind in ("fp16", "rgba8")},
             warping(photos, reference, scene.info.radius, config.warping_views),
             scorers(lpips_networks(config.lpips), config.lpips_folder),

@@ -225,7 +225,7 @@ def test_masked_pixels_are_left_out(run):
 
 
 def test_exposure_is_found_on_the_left_half_and_scored_on_the_right(run):
-    dim = {"capture": {"gain": 0.6}, "fit": {"error": 0.0}}
+    dim = {"capture": {"gain": 0.6}, "fit": {"error": 0.0}, "bake": {"residuals": 0}}  # they would show the photos' exposure
     plain, _ = run(**dim)
     artifacts, _ = run(**dim, evaluate=QUICK | {"exposure": "half"})
     before = views_of(plain["evaluate"])
@@ -251,7 +251,7 @@ def test_without_opengl_and_browser_the_report_says_what_is_missing(run, no_open
     monkeypatch.setattr("stages.graphics.browser.find_browser", lambda: None)
     artifacts, _ = run(evaluate={**QUICK, "video_frames": 2, "page_views": 2, "depth_tolerance": 0.06})
     views = views_of(artifacts["evaluate"])
-    assert all(set(row["scores"]) == {"ours", "warping"} and not row["agreement"] for row in views.values())
+    assert all(set(row["scores"]) == {"ours", "textures", "warping"} and not row["agreement"] for row in views.values())
     html = artifacts["evaluate"].file("report.html").read_text()
     for words in ("libegl1", "install chromium", "LPIPS", "FID and KID", "force=evaluate"):
         assert words in html

@@ -15,9 +15,8 @@ import numpy as np
 from stages.graphics import browser
 
 READY = "document.documentElement?.dataset.ready ?? ''"
-SETTLED = (
-    "!lightmill.scene.tiles || Boolean(lightmill.tiles?.settled())"  # all that this view needs of a scene in tiles is there
-)
+# all that this view needs of a scene in tiles, and of residuals, is there
+SETTLED = "(!lightmill.scene.tiles || Boolean(lightmill.tiles?.settled())) && lightmill.settled()"
 TIMES = """(() => {
   const { gl } = lightmill, times = [];
   for (let i = 0; i < COUNT; i++) {

@@ -10,10 +10,12 @@ import numpy as np
 from model.neuras.baked import Baked
 from pipeline.errors import UserError
 from stages.graphics.cameras import Camera
+from stages.neuras.baking.residuals import Residuals
 from stages.neuras.baking.shaders import MODES, Ranges, mesh_shaders, resolve_shaders, sky_shaders, textures
 from stages.neuras.records import AtlasMesh
 
 TextureFormat = Literal["fp16", "rgba8"]
+LAYERS = 16  # residuals on the device at a time, those of the photos that were taken last
 INSTALL = "install EGL and a driver, such as the packages libegl1 and libgl1-mesa-dri"
 
 
@@ -53,10 +55,18 @@ class Drawing:
     """A scene on the GPU. Use as a context manager, or ``close`` it.
 
     texture_format: "fp16" holds features as half floats, "rgba8" as bytes with a range per channel. ``near`` and ``far``: of
-    the depth buffer, world units.
+    the depth buffer, world units. residuals: those that are added.
     """
 
-    def __init__(self, baked: Baked, atlas: AtlasMesh, near: float, far: float, texture_format: TextureFormat = "fp16"):
+    def __init__(
+        self,
+        baked: Baked,
+        atlas: AtlasMesh,
+        near: float,
+        far: float,
+        texture_format: TextureFormat = "fp16",
+        residuals: Residuals | None = None,
+    ):
         self._gl = context()
         self._near, self._far = near, far
         self._centre = np.asarray(baked.sky_centre, float)
@@ -67,8 +77,8 @@ class Drawing:
             raise UserError(f"the texture is {mesh.shape[1]} x {mesh.shape[0]}, OpenGL here takes {largest}: lower atlas.size")
         exact = texture_format == "fp16"
         mesh_ranges, sky_ranges = (None, None) if exact else (Ranges.of(mesh), Ranges.of(sky))
-        self._mesh = self._gl.program(*mesh_shaders(baked, "desktop", mesh_ranges))
-        self._sky = self._gl.program(*sky_shaders(baked, "desktop", sky_ranges))
+        self._mesh = self._gl.program(*mesh_shaders(baked, "desktop", mesh_ranges, photos=residuals))
+        self._sky = self._gl.program(*sky_shaders(baked, "desktop", sky_ranges, residuals))
         self._resolve = self._gl.program(*resolve_shaders(baked, "desktop"))
         self._textures = [
             *self._upload(self._mesh, "mesh", mesh[None], mesh_ranges, array=False),
@@ -79,6 +89,7 @@ class Drawing:
             texture = self._gl.texture(codes.shape[::-1], 1, np.ascontiguousarray(codes).tobytes(), alignment=1, dtype="u2")
             texture.filter = (self._gl.NEAREST, self._gl.NEAREST)
             self._textures.append((self._mesh, "codes", texture))
+        self._photos = None if residuals is None else _Photos(self._gl, residuals)
         vertices = np.concatenate([atlas.vertices - self._centre, atlas.uvs, atlas.vertex_charts()[:, None]], axis=1).astype(
             np.float32
         )
@@ -153,6 +164,10 @@ class Drawing:
             if name in program:
                 texture.use(unit)
                 program[name] = unit
+        if self._photos is not None:
+            self._photos.choose(eye)
+            for program in (self._mesh, self._sky):
+                self._photos.use(program, len(self._textures))
         self._fine.use()
         self._fine.clear(0.0, 0.0, 0.0, 1.0, depth=1.0)
         self._gl.enable(self._gl.DEPTH_TEST)
@@ -190,3 +205,55 @@ class Drawing:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+class _Photos:
+    """Residuals on the device: two texture arrays, a layer for each photo that was wanted last."""
+
+    def __init__(self, gl: Any, residuals: Residuals):
+        self._residuals = residuals
+        self._layers: dict[int, int] = {}  # of photos, the one that was wanted longest ago first
+        count = min(max(LAYERS, residuals.nearest), len(residuals.eyes))
+        self._free = list(range(count))
+        self._values = gl.texture_array((*residuals.size, count), 3, dtype="f1", alignment=1)
+        self._values.filter = (gl.LINEAR, gl.LINEAR)
+        self._values.repeat_x = self._values.repeat_y = False
+        self._depths = gl.texture_array((*residuals.size, count), 2, dtype="f1", alignment=1)
+        self._depths.filter = (gl.NEAREST, gl.NEAREST)
+        self._uniforms: dict[str, bytes] = {}
+
+    def choose(self, eye: np.ndarray) -> None:
+        """The photos of a view from ``eye`` (3,), relative to the skyboxes' centre."""
+        chosen, weights = self._residuals.chosen(eye)
+        matrices, eyes, about = np.zeros((len(chosen), 4, 4)), np.zeros((len(chosen), 3)), np.zeros((len(chosen), 4))
+        for index, (number, weight) in enumerate(zip(chosen, weights, strict=True)):
+            source, layer = self._residuals.source(number), self._layer(number)
+            matrices[index, :, :3], eyes[index] = source.matrix.T, source.eye  # column after column
+            about[index] = (weight, *source.depths.shape[::-1], layer)
+        self._uniforms = {
+            name: value.astype(np.float32).tobytes()
+            for name, value in (("photo_matrix", matrices), ("photo_eye", eyes), ("photo_about", about))
+        }
+
+    def _layer(self, number: int) -> int:
+        """Where the photo lies, written there if it does not yet."""
+        layer = self._layers.pop(number, None)
+        if layer is None:
+            layer = self._free.pop() if self._free else self._layers.pop(next(iter(self._layers)))
+            source = self._residuals.source(number)
+            height, width = source.depths.shape
+            place = (0, 0, layer, width, height, 1)
+            self._values.write(np.ascontiguousarray(source.values).tobytes(), place, alignment=1)
+            self._depths.write(source.depths.astype("<u2").tobytes(), place, alignment=1)  # low byte, high byte
+        self._layers[number] = layer
+        return layer
+
+    def use(self, program: Any, unit: int) -> None:
+        """Bind both textures from ``unit`` on, and set the program's uniforms."""
+        for offset, (name, texture) in enumerate((("residuals", self._values), ("depths", self._depths))):
+            if name in program:
+                texture.use(unit + offset)
+                program[name] = unit + offset
+        for name, data in self._uniforms.items():
+            if name in program:
+                program[name].write(data)

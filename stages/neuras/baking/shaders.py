@@ -13,6 +13,8 @@ import numpy as np
 
 from model.neuras.baked import Baked, Layer
 from model.neuras.sampling import Pyramid
+from stages.neuras.baking import residuals
+from stages.neuras.baking.residuals import Residuals
 
 DIALECTS = {
     "desktop": "#version 330\n",
@@ -94,9 +96,12 @@ def textures(channels: int) -> int:
     return -(-channels // 4)
 
 
-def mesh_shaders(baked: Baked, dialect: str, ranges: Ranges | None, tiled: bool = False) -> tuple[str, str]:
+def mesh_shaders(
+    baked: Baked, dialect: str, ranges: Ranges | None, tiled: bool = False, photos: Residuals | None = None
+) -> tuple[str, str]:
     """Vertex and fragment shader of the mesh. ``ranges``: None where textures hold features themselves (half floats).
-    ``tiled``: textures are a pool of tiles' images, and a table says where in it a chart's levels lie (``_in_pool``)."""
+    ``tiled``: textures are a pool of tiles' images, and a table says where in it a chart's levels lie (``_in_pool``).
+    ``photos``: whose residuals are added."""
     count, pyramid = textures(baked.channels), baked.pyramid
     samplers = "".join(f"uniform sampler2D mesh{i};\n" for i in range(count))
     features = "".join(f"    vec4 f{i} = {_texel(_levels(pyramid, f'mesh{i}', tiled), ranges, i)};\n" for i in range(count))
@@ -109,10 +114,11 @@ in vec3 ray;
 flat in float chart_number;
 out vec4 colour;
 uniform int mode;
+uniform vec3 eye;
 uniform vec3 pixel_right;  // from one pixel to the next at distance 1: the camera's right over its focal length in pixels
 uniform vec3 pixel_down;
 uniform usampler2D codes;
-{samplers}{COLOURS}{_pyramid(pyramid, tiled)}
+{samplers}{COLOURS}{_pyramid(pyramid, tiled)}{residual_lookup(photos)}
 {_network("mesh_colour", baked.mesh_mlp, count, baked.channels, baked.view_dependent)}
 void main() {{
     if (mode == 2) discard;
@@ -122,7 +128,9 @@ void main() {{
         colour = vec4(number_colour(float(texelFetch(codes, ivec2({texel}), 0).r)), 1.0);
         return;
     }}
-{_footprint(pyramid, tiled)}{features}    colour = vec4(clamp(mesh_colour({_features(count)}, normalize(ray)), 0.0, 1.0), 1.0);
+{_footprint(pyramid, tiled)}{features}    vec3 way = normalize(ray);
+    vec3 light = clamp(mesh_colour({_features(count)}, way), 0.0, 1.0);
+{_added(photos, "eye + ray, 1.0")}    colour = vec4(light, 1.0);
 }}
 """
     return DIALECTS[dialect] + MESH_VERTEX, DIALECTS[dialect] + body
@@ -143,7 +151,7 @@ void main() {{
     return DIALECTS[dialect] + RESOLVE_VERTEX, DIALECTS[dialect] + body
 
 
-def sky_shaders(baked: Baked, dialect: str, ranges: Ranges | None) -> tuple[str, str]:
+def sky_shaders(baked: Baked, dialect: str, ranges: Ranges | None, photos: Residuals | None = None) -> tuple[str, str]:
     """Vertex and fragment shader of the skyboxes, composited near to far in one pass (eq. 4)."""
     count, (layers, _) = textures(baked.channels), baked.sky_size
     samplers = "".join(f"uniform sampler2DArray sky{i};\n" for i in range(count))
@@ -162,7 +170,7 @@ out vec4 colour;
 uniform int mode;
 uniform int only;  // show this skybox alone; -1: all
 uniform vec3 eye;
-{samplers}
+{samplers}{residual_lookup(photos)}
 const vec3 half_sizes[{layers}] = vec3[{layers}]({halves});
 {_network("sky_colour", baked.sky_mlp[1:], len(seen), width, baked.view_dependent)}
 void leave(vec3 start, vec3 way, vec3 size, out int face, out vec2 st) {{  // where a ray from inside leaves the cuboid
@@ -190,10 +198,59 @@ void main() {{
         passed *= 1.0 - opacity;
         if (passed < 0.0005) break;  // an eighth of an 8-bit step
     }}
-    colour = vec4(mode == 3 ? vec3(1.0 - passed) : clamp(light, 0.0, 1.0), 1.0);
+    if (mode == 3) {{ colour = vec4(vec3(1.0 - passed), 1.0); return; }}
+    light = clamp(light, 0.0, 1.0);
+{_added(photos, "way, 0.0", "if (only < 0) ")}    colour = vec4(light, 1.0);
 }}
 """
     return DIALECTS[dialect] + SKY_VERTEX, DIALECTS[dialect] + body
+
+
+def residual_lookup(photos: Residuals | None) -> str:
+    """The function that sums up residuals: ``Residuals.at``. The photos that a view takes are uniforms."""
+    if photos is None:
+        return ""
+    count, steps = photos.nearest, np.log2(photos.far / photos.near) / (residuals.MASKED - 2)
+    return f"""
+precision highp sampler2DArray;
+uniform sampler2DArray residuals;
+uniform sampler2DArray depths;       // codes of the distance that a photo's pixel sees: low byte, high byte
+uniform mat4 photo_matrix[{count}];    // from the scene to column * ahead, row * ahead, ahead
+uniform vec3 photo_eye[{count}];
+uniform vec4 photo_about[{count}];     // weight, width, height, layer
+vec3 residual(vec3 point, float on_mesh, vec3 way) {{  // off the mesh the point is the way, and lies infinitely far
+    vec3 total = vec3(0.0);
+    float weights = 0.0;
+    for (int k = 0; k < {count}; k++) {{
+        vec4 about = photo_about[k];
+        vec3 at = (photo_matrix[k] * vec4(point, on_mesh)).xyz;
+        if (about.x <= 0.0 || at.z <= 0.0) continue;
+        vec2 place = at.xy / at.z;
+        vec2 inner = min(place - 0.5, about.yz - 0.5 - place);
+        float border = clamp(min(inner.x, inner.y) / ({_number(residuals.BORDER)} * max(about.y, about.z)), 0.0, 1.0);
+        if (border <= 0.0) continue;
+        float code = dot(floor(255.0 * texelFetch(depths, ivec3(ivec2(place), int(about.w)), 0).rg + 0.5), vec2(1.0, 256.0));
+        vec3 away = point - photo_eye[k];
+        float apart = max(length(away), 1e-12);
+        float seen = {_number(photos.near)} * exp2((code - 1.0) * {_number(steps)});
+        float same = clamp(1.5 - abs(seen - apart) / ({_number(residuals.TOLERANCE)} * apart), 0.0, 1.0);
+        bool hit = code != {residuals.OPEN}.0 && code != {residuals.MASKED}.0;
+        float agrees = on_mesh > 0.0 ? (hit ? same : 0.0) : (code == {residuals.OPEN}.0 ? 1.0 : 0.0);
+        float cosine = on_mesh > 0.0 ? dot(away, way) / apart : 1.0;
+        float share = about.x * border * agrees;
+        vec3 value = texture(residuals, vec3(place / vec2(textureSize(residuals, 0).xy), about.w)).rgb;
+        float fade = exp((cosine - 1.0) / {_number(1 - np.cos(photos.angle))});
+        total += share * fade * (value - {_number(residuals.NEUTRAL / 255)});
+        weights += share;
+    }}
+    return total / max(weights, {_number(residuals.LEAST)});
+}}
+"""
+
+
+def _added(photos: Residuals | None, where: str, condition: str = "") -> str:
+    """The statement that adds residuals to ``light``; ``where``: the point, and whether it lies on the mesh."""
+    return "" if photos is None else f"    {condition}light = clamp(light + residual({where}, way), 0.0, 1.0);\n"
 
 
 def _pyramid(pyramid: Pyramid, tiled: bool) -> str:

@@ -11,6 +11,7 @@ codebooks.bin      float32: mesh codes (K, D), then sky codes (K, D)
 mesh_I.png, ...    features of scenes without quantization: bytes in RGBA, four channels each (``ranges`` in scene.json)
 shaders/           GLSL ES 3.00 for WebGL 2 and GLSL 3.30 for engines
 frames/            original photos, to compare with
+residuals/         what single photos know beyond the textures (``stages.neuras.baking.residuals``)
 tiles/N/           of a scene cut into tiles (``stages.neuras.baking.tiles``): ``geometry.glb``, with texture coordinates of the
                    whole texture and _CHART counted anew, and ``level_L.bin``, compressed by gzip: int32 (P, 8), where each of
                    the P charts lies (``Tiles.table``), then rows of texels: codes, uint16, or bytes in RGBA, one map after the
@@ -35,6 +36,7 @@ from PIL import Image
 
 from model.neuras.baked import Baked
 from stages.neuras.baking.drawing import lens
+from stages.neuras.baking.residuals import Residuals
 from stages.neuras.baking.shaders import MODES, Ranges, mesh_shaders, resolve_shaders, sky_shaders, textures
 from stages.neuras.baking.tiles import Tiles
 from stages.neuras.records import FRAME, AtlasMesh, CaptureInfo, FrameRecord
@@ -52,11 +54,13 @@ def write_site(
     depth_range: tuple[float, float],
     expand: str,
     tiles: Tiles | None = None,
+    photos: Residuals | None = None,
 ) -> dict[str, int]:
-    """Write the site; returns the bytes of its kinds of files: "geometry", "textures", "shaders", "page".
+    """Write the site; returns the bytes of its kinds of files: "geometry", "textures", "shaders", "page" and so on.
 
     frames: those whose photos and cameras the page offers. depth_range: near and far plane, world units. expand: what the
-    page's loader makes of codes, "rgba8" or "fp16". tiles: the scene as it is cut; None: in one piece.
+    page's loader makes of codes, "rgba8" or "fp16". tiles: the scene as it is cut; None: in one piece. photos: residuals that
+    lie in the folder already.
     """
     (folder / "shaders").mkdir(parents=True, exist_ok=True)
     (folder / "frames").mkdir(exist_ok=True)
@@ -78,8 +82,8 @@ def write_site(
                 Image.fromarray(part, "RGBA").save(folder / f"{name}_{index}.png")
     for dialect in ("web", "desktop"):
         programs = {
-            "mesh": mesh_shaders(baked, dialect, ranges["mesh"], tiled),
-            "sky": sky_shaders(baked, dialect, ranges["sky"]),
+            "mesh": mesh_shaders(baked, dialect, ranges["mesh"], tiled, photos),
+            "sky": sky_shaders(baked, dialect, ranges["sky"], photos),
             "resolve": resolve_shaders(baked, dialect),
         }
         for name, program in programs.items():
@@ -109,6 +113,8 @@ def write_site(
         "far": depth_range[1],
         "frames": views,
     }
+    if photos is not None:
+        scene["residuals"] = photos.about
     if tiled:
         scene["tiles"] = _tiles(folder / "tiles", baked, tiles, ranges["mesh"])
     (folder / "scene.json").write_text(json.dumps(scene, indent=1, allow_nan=False) + "\n")
@@ -244,7 +250,7 @@ def _view(folder: Path, frame: FrameRecord, centre: np.ndarray) -> dict[str, Any
 
 def sizes(folder: Path) -> dict[str, int]:
     """Bytes of a site's kinds of files."""
-    kinds = {"geometry": 0, "textures": 0, "shaders": 0, "frames": 0, "page": 0}
+    kinds = {"geometry": 0, "textures": 0, "shaders": 0, "residuals": 0, "frames": 0, "page": 0}
     for path in folder.rglob("*"):
         if path.is_file():
             kind = path.relative_to(folder).parts[0] if path.parent != folder else "page"

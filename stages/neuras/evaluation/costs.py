@@ -91,7 +91,7 @@ def storage(folder: Path, baked: Baked) -> dict[str, Any]:
     The photos and the page itself are no part of the scene. ``without_codes``: every texel's features as half floats.
     """
     kinds = site.sizes(folder)
-    scene = kinds["geometry"] + kinds["textures"] + kinds["shaders"]
+    scene = kinds["geometry"] + kinds["textures"] + kinds["shaders"] + kinds["residuals"]
     (height, width), (layers, side) = baked.mesh_size, baked.sky_size
     features = HALF * baked.channels * (height * width + 6 * layers * side * side)
     return {

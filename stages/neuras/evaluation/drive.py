@@ -55,8 +55,10 @@ def scene_of(store: Store, reference: str) -> tuple[Scene, Artifact]:
     artifact = store.resolve(reference)
     if artifact.stage not in ("bake", "evaluate") or "atlas" not in artifact.manifest["preimage"]["inputs"]:
         raise UserError(f"{artifact.name} is no baked scene: give one of stage bake (`lightmill ls neuras/bake` lists them)")
-    inputs = {}
-    for role in ("capture", "atlas", "fit"):
+    inputs = {"bake": artifact} if artifact.stage == "bake" else {}
+    for role in ("capture", "atlas", "fit", "bake"):
+        if role in inputs:
+            continue
         found = store.by_key(artifact.manifest["preimage"]["inputs"][role])
         if found is None:
             raise UserError(f"{artifact.name}: the store no longer has its {role}; run its line again")

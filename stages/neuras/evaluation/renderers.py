@@ -17,15 +17,16 @@ from pipeline.store import Artifact
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster, GBuffer
 from stages.neuras.baking import drawing
+from stages.neuras.baking.residuals import Residuals
 from stages.neuras.rasterizing.footprints import footprint
 from stages.neuras.records import AtlasMesh, CaptureInfo, load_atlas
 
 
 class Reference:
-    """The scene by torch, slow and exact (``Baked.render``). Use as a ``Drawing``."""
+    """The scene by torch, slow and exact: ``Baked.render``, and ``Residuals.at`` where there are some. Use as a ``Drawing``."""
 
-    def __init__(self, baked: Baked, atlas: AtlasMesh):
-        self._baked, self._atlas = baked, atlas
+    def __init__(self, baked: Baked, atlas: AtlasMesh, residuals: Residuals | None = None):
+        self._baked, self._atlas, self._residuals = baked, atlas, residuals
         self.rays = baked.rays
         self.caster = Caster(atlas.vertices, atlas.faces)
 
@@ -40,6 +41,10 @@ class Reference:
         covered = footprint(view, camera, self._atlas)
         looks = uv, covered.spread.reshape(-1, 2), covered.detail.ravel(), view.hit.ravel()
         colours, _ = self._baked.render(*looks, camera.position, rays)
+        if self._residuals is not None:
+            eye = camera.position - self._baked.sky_centre
+            added = self._residuals.at(eye, rays, view.depth.ravel().astype(float))
+            colours = np.clip(colours + added, 0, 1).astype(np.float32)
         return colours.reshape(camera.height, camera.width, 3)
 
     def close(self) -> None:
@@ -48,28 +53,30 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is drawn: the fitted maps and networks, the mesh that they lie on, and facts of the capture."""
+    """What is drawn: the fitted maps and networks, the mesh that they lie on, facts of the capture, and residuals of photos."""
 
     baked: Baked
     atlas: AtlasMesh
     info: CaptureInfo
+    residuals: Residuals | None = None
 
     @classmethod
     def of(cls, inputs: Mapping[str, Artifact]) -> Scene:
-        """Of artifacts by role: capture, atlas, fit."""
+        """Of artifacts by role: capture, atlas, fit, bake."""
         return cls(
             Baked.load(inputs["fit"].path / "files"),
             load_atlas(inputs["atlas"].file("atlas.npz")),
             CaptureInfo.of(inputs["capture"]),
+            Residuals.load(inputs["bake"].file("site")),
         )
 
     def reference(self) -> Reference:
-        return Reference(self.baked, self.atlas)
+        return Reference(self.baked, self.atlas, self.residuals)
 
     def drawing(self, texture_format: drawing.TextureFormat = "fp16") -> drawing.Drawing:
         """By OpenGL; UserError where the machine has none."""
         planes = drawing.depth_range(self.atlas.vertices, self.info.metre)
-        return drawing.Drawing(self.baked, self.atlas, *planes, texture_format)
+        return drawing.Drawing(self.baked, self.atlas, *planes, texture_format, self.residuals)
 
 
 def opengl() -> str | None:

@@ -15,6 +15,7 @@ from stages.neuras.evaluation.scores import PLACES, told, worst
 METHODS = {
     "ours": "ours, torch",
     "shader": "ours, baked shader",
+    "textures": "ours, without residuals",
     "warping": "multi-view warping",
 }
 View = Mapping[str, Any]  # a record's metrics.json, see stages.neuras.s06_evaluate

@@ -58,12 +58,14 @@ class Aligner:
 
 @dataclass(frozen=True, eq=False)
 class Examiner:
-    """Draws and measures views. drawings: the baked shader by texture format; empty without OpenGL. exposure: whether every
-    picture takes the photo's exposure, found on the left half. aligner: turns and shifts the view's camera until its left half
-    agrees with the training photos; without it the camera is the capture's. With either, the right half alone is scored.
+    """Draws and measures views. textures: the scene without residuals, where it has some. drawings: the baked shader by texture
+    format; empty without OpenGL. exposure: whether every picture takes the photo's exposure, found on the left half. aligner:
+    turns and shifts the view's camera until its left half agrees with the training photos; without it the camera is the
+    capture's. With either, the right half alone is scored.
     """
 
     reference: Reference
+    textures: Reference | None
     drawings: Mapping[str, Drawing]
     warping: Warping
     scorers: Mapping[str, scores.Scorer]
@@ -83,6 +85,8 @@ class Examiner:
         pictures = {"ours": as_bytes(exact), "warping": as_bytes(warped)}
         if drawn:
             pictures["shader"] = as_bytes(drawn["fp16"])
+        if self.textures is not None:
+            pictures["textures"] = as_bytes(self.textures.render(frame.camera))
         if self.exposure:
             pictures = {name: matched(picture, photo, known) for name, picture in pictures.items()}
         if self.exposure or self.aligner is not None:

@@ -1,6 +1,6 @@
 // Reads the files of a baked scene and makes textures' data of them.
 
-const get = async (name) => {
+export const fetched = async (name) => {
   const answer = await fetch(name);
   if (!answer.ok) throw new Error(`${name} cannot be read (${answer.status}): is the folder complete?`);
   return answer;
@@ -55,11 +55,11 @@ function readGeometry(buffer) {
 }
 
 export async function loadScene(say) {
-  const scene = await (await get("scene.json")).json();
+  const scene = await (await fetched("scene.json")).json();
   scene.bytes = 0;
   const bytes = async (name) => {
     say(`Loading ${name} ..`);
-    const blob = await (await get(name)).blob();
+    const blob = await (await fetched(name)).blob();
     scene.bytes += blob.size;
     return blob;
   };

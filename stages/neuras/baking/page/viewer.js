@@ -1,5 +1,6 @@
 // Draws a baked scene with WebGL 2. What each file holds is said by scene.json and in the project's docs.
 import { expandCodes, loadScene } from "./loader.js";
+import { Residuals } from "./residuals.js";
 
 const element = (id) => document.getElementById(id);
 const SPEED = 6; // metres per second
@@ -81,6 +82,7 @@ class Viewer {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.R16UI, width, height, 0, gl.RED_INTEGER, gl.UNSIGNED_SHORT, source);
     this.clampTo(gl.TEXTURE_2D, gl.NEAREST);
     this.textures.push([this.mesh, "codes", gl.TEXTURE_2D, codes]);
+    this.residuals = scene.residuals ? new Residuals(this) : null;
 
     this.vertices = gl.createVertexArray();
     gl.bindVertexArray(this.vertices);
@@ -197,6 +199,7 @@ class Viewer {
       gl.bindTexture(target, texture);
       set(program, name, "uniform1i", index);
     });
+    this.residuals?.use([this.mesh, this.sky], this.textures.length, pose.eye);
     gl.useProgram(this.mesh);
     const matrix = multiply(projection(this.lens, scene.near, scene.far), viewOf(pose));
     set(this.mesh, "clip_from_scene", "uniformMatrix4fv", false, transposed(matrix));
@@ -224,6 +227,10 @@ class Viewer {
     gl.bindTexture(gl.TEXTURE_2D, fine.colour);
     set(this.resolve, "rays", "uniform1i", 0);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  settled() { // whether all is here that this view shows
+    return !this.residuals || this.residuals.settled(this.camera().eye);
   }
 
   goTo(index) { // a drive ends there
@@ -338,6 +345,8 @@ function controls(viewer) {
   element("wireframe").onchange = (event) => { viewer.wireframe = event.target.checked; };
   element("smooth").onchange = (event) => { viewer.smooth = event.target.checked; };
   element("smooth").parentElement.hidden = scene.rays === 1;
+  element("residuals").onchange = (event) => { viewer.residuals.on = event.target.checked; };
+  element("residuals").parentElement.hidden = !viewer.residuals;
   element("compare").onchange = (event) => {
     for (const id of ["photo", "split"]) element(id).hidden = !event.target.checked;
     if (event.target.checked) viewer.goTo(viewer.frame);

@@ -1,0 +1,219 @@
+"""Residuals: what single photos know beyond the textures, added where a photo was taken close by.
+
+A texture holds the mean of what all photos say of a place. A photo from nearby knows more: the sheen as it looks from there,
+and detail that the mean blurs where mesh or cameras are a little off. A *residual* is a training photo less the fitted scene's
+picture from the same camera. A new view adds the residuals of the nearest photos, moved by the depth of the mesh, as warping
+moves whole photos. They fade with the angle between the rays that see a point from here and from there. So on the driven
+path a view is nearly what warping shows, and far beside it what the textures show.
+
+No part of the paper. ``Residuals.at`` says what is computed; ``shaders.residual_lookup`` is the same in GLSL. Coordinates are
+relative to the skyboxes' centre, as everywhere in a site. Files: ``residuals/NAME.png``, bytes b of a residual (b - 128) / 255
+in RGB, and ``residuals/NAME.depth.png``, 16-bit codes of the distance that each pixel sees, low byte in R, high byte in G.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from PIL import Image
+
+from model.neuras.exposure import matched
+from stages.graphics.cameras import Camera
+from stages.graphics.casting import Caster
+from stages.neuras.records import FRAME, FrameRecord
+
+FOLDER = "residuals"
+TOLERANCE = 0.02  # relative difference of depth at which half of a residual is left: all at half of it, none at 1.5 times
+BORDER = 0.03  # share of a photo's longer side over which it fades towards its border
+LEAST = 0.1  # share of the photos' weights below which residuals fade: none comes or goes at once
+NEUTRAL = 128  # byte of no residual
+OPEN, MASKED = 0, 65535  # codes of depth: nothing hit, and a pixel that does not count
+CACHED = 16  # sources kept in memory
+
+
+class Renderer(Protocol):
+    """The scene by torch, without residuals."""
+
+    caster: Caster
+
+    def render(self, camera: Camera) -> np.ndarray: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """The residual of one photo. values: (H, W, 3) uint8. depths: (H, W) uint16, codes. matrix: (3, 4), from a point of the
+    scene to (column * ahead, row * ahead, ahead), in pixels from the image's upper left corner. eye: (3,), where it was taken.
+    """
+
+    values: np.ndarray
+    depths: np.ndarray
+    matrix: np.ndarray
+    eye: np.ndarray
+
+
+class Residuals:
+    """All residuals of a site; pictures are read when they are needed. ``about``: the part "residuals" of its ``scene.json``.
+
+    nearest: photos that a view takes. angle: radians at which a residual has faded to 1/e. near, far: the distances of the
+    first and the last code of depth. size: width and height of the largest picture. eyes: (K, 3).
+    """
+
+    def __init__(self, folder: Path, about: dict[str, Any]):
+        self.about = about
+        self._folder, self._sources = folder, about["sources"]
+        self.nearest: int = about["nearest"]
+        self.angle: float = about["angle"]
+        self.near, self.far = about["near"], about["far"]
+        self.soft: float = about["soft"]
+        self.eyes = np.array([source["eye"] for source in self._sources], float).reshape(-1, 3)
+        self.size = tuple(max(source[name] for source in self._sources) for name in ("width", "height"))
+        self.source = functools.lru_cache(CACHED)(self._read)
+
+    @classmethod
+    def load(cls, site: Path) -> Residuals | None:
+        """Of a baked site; None where it has none."""
+        about = json.loads((site / "scene.json").read_bytes()).get("residuals")
+        return None if about is None else cls(site / FOLDER, about)
+
+    @classmethod
+    def make(
+        cls,
+        site: Path,
+        scene: Renderer,
+        frames: Iterable[FrameRecord],
+        centre: np.ndarray,
+        depth_range: tuple[float, float],
+        soft: float,
+        nearest: int,
+        angle_deg: float,
+        exposure: bool = False,
+    ) -> Residuals | None:
+        """Write the residuals of the frames' photos to a site; None where there is no photo.
+
+        centre: (3,) of the skyboxes, world. depth_range: distances that codes of depth span, world units. soft: distance, world
+        units, within which photos weigh alike. exposure: whether each photo first takes the exposure of the scene's picture,
+        for scenes that were fitted so.
+        """
+        (site / FOLDER).mkdir(parents=True, exist_ok=True)
+        sources = [
+            _write(site / FOLDER, scene, frame, centre, depth_range, exposure)
+            for frame in frames
+            if min(frame.camera.width, frame.camera.height) > 1  # of one row nothing is mixed
+        ]
+        near, far = depth_range
+        about = {
+            "nearest": min(nearest, len(sources)),
+            "angle": float(np.radians(angle_deg)),
+            "near": near,
+            "far": far,
+            "soft": soft,
+            "sources": sources,
+        }
+        return cls(site / FOLDER, about) if sources else None
+
+    def _read(self, number: int) -> Source:
+        source = self._sources[number]
+        values = np.array(Image.open(self._folder / f"{source['name']}.png").convert("RGB"))
+        codes = np.array(Image.open(self._folder / f"{source['name']}.depth.png").convert("RGB")).astype(np.uint16)
+        return Source(values, codes[..., 0] + 256 * codes[..., 1], np.array(source["matrix"]), np.array(source["eye"]))
+
+    def chosen(self, eye: np.ndarray) -> tuple[list[int], np.ndarray]:
+        """Numbers of the photos that a view from ``eye`` (3,) takes, and their weights, which sum to 1.
+
+        The nearer weighs more. A photo's weight has fallen to 0 where another one takes its place, so nothing jumps.
+        """
+        distances = np.linalg.norm(self.eyes - eye, axis=1)
+        order = np.argsort(distances, kind="stable")[: self.nearest + 1]
+        closeness = 1 / (distances[order] + self.soft)
+        weights = closeness[: self.nearest] - (closeness[self.nearest] if len(order) > self.nearest else 0)
+        return order[: self.nearest].tolist(), weights / max(float(weights.sum()), 1e-30)
+
+    def at(self, eye: np.ndarray, ways: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """(N, 3) float64, to be added to the colours of rays from ``eye`` (3,) along unit ``ways`` (N, 3).
+
+        depth: (N,), the distance to the mesh, 0 where it is missed; such rays are taken to see something infinitely far.
+
+            sum_k w_k f_k r_k / max(sum_k w_k, LEAST)    with    w_k = weight * border * agreement
+
+        weight: of ``chosen``. border: from 0 at a photo's outermost pixels to 1 within. agreement: of the distance that the
+        photo's nearest pixel sees with the point's. r_k: the residual, bilinear. f_k = exp((cos a - 1) / (1 - cos angle)), with
+        the angle a between the two rays that see the point.
+        """
+        hit = depth > 0
+        far = np.where(hit, 1.0, 0.0)
+        points = np.where(hit[:, None], eye + ways * depth[:, None], ways)
+        total, weights = np.zeros((len(ways), 3)), np.zeros(len(ways))
+        for number, weight in zip(*self.chosen(eye), strict=True):
+            if weight <= 0:
+                continue
+            source = self.source(number)
+            height, width = source.depths.shape
+            local = points @ source.matrix[:, :3].T + far[:, None] * source.matrix[:, 3]
+            ahead = local[:, 2] > 0
+            x, y = np.where(ahead[:, None], local[:, :2] / np.where(ahead, local[:, 2], 1)[:, None], 0).T
+            edge = np.minimum(np.minimum(x - 0.5, width - 0.5 - x), np.minimum(y - 0.5, height - 0.5 - y))
+            border = np.clip(edge / (BORDER * max(width, height)), 0, 1) * ahead
+            x, y = np.clip(x, 0.5, width - 0.5), np.clip(y, 0.5, height - 0.5)
+            code = source.depths[np.minimum(y.astype(int), height - 1), np.minimum(x.astype(int), width - 1)]
+            away = points - source.eye
+            distance = np.maximum(np.linalg.norm(away, axis=1), 1e-12)
+            same = np.clip(1.5 - np.abs(self.distance(code) - distance) / (TOLERANCE * distance), 0, 1)
+            agrees = np.where(hit, same * ((code != OPEN) & (code != MASKED)), code == OPEN)
+            cosine = np.where(hit, np.einsum("ij,ij->i", away, ways) / distance, 1)
+            fade = np.exp((cosine - 1) / (1 - np.cos(self.angle)))
+            share = weight * border * agrees
+            total += (share * fade)[:, None] * (_bilinear(source.values, x - 0.5, y - 0.5) - NEUTRAL) / 255
+            weights += share
+        return total / np.maximum(weights, LEAST)[:, None]
+
+    def distance(self, codes: np.ndarray) -> np.ndarray:
+        """What codes of depth stand for."""
+        return self.near * (self.far / self.near) ** ((codes.astype(float) - 1) / (MASKED - 2))
+
+
+def _bilinear(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(N, 3) of (H, W, 3) at columns and rows within the image."""
+    height, width = values.shape[:2]
+    column, row = (np.minimum(at.astype(int), size - 2) for at, size in ((x, width), (y, height)))
+    right, down = (x - column)[:, None], (y - row)[:, None]
+    upper = values[row, column] * (1 - right) + values[row, column + 1] * right
+    lower = values[row + 1, column] * (1 - right) + values[row + 1, column + 1] * right
+    return upper * (1 - down) + lower * down
+
+
+def _write(
+    folder: Path, scene: Renderer, frame: FrameRecord, centre: np.ndarray, depth_range: tuple[float, float], exposure: bool
+) -> dict[str, Any]:
+    """Write one photo's two files; returns what ``scene.json`` says of it."""
+    name, camera, counts = frame.id.removeprefix(FRAME), frame.camera, frame.counts()
+    picture, photo = 255 * scene.render(camera).astype(float), frame.image()
+    if exposure and counts.any():
+        photo = matched(photo, np.rint(picture).astype(np.uint8), counts)
+    values = np.where(counts[..., None], np.clip(np.rint(photo - picture) + NEUTRAL, 0, 255), NEUTRAL)
+    near, far = depth_range
+    depth = scene.caster.view(camera).depth.astype(float)
+    codes = 1 + np.rint((MASKED - 2) * np.log(np.clip(depth, near, far) / near) / np.log(far / near))
+    codes = np.where(counts, np.where(depth > 0, codes, OPEN), MASKED).astype(np.uint16)
+    Image.fromarray(values.astype(np.uint8)).save(folder / f"{name}.png")
+    Image.fromarray(np.stack([codes & 255, codes >> 8, 0 * codes], axis=-1).astype(np.uint8)).save(folder / f"{name}.depth.png")
+    eye = camera.position - centre
+    return {
+        "name": name,
+        "width": camera.width,
+        "height": camera.height,
+        "matrix": _matrix(camera, eye).tolist(),
+        "eye": eye.tolist(),
+    }
+
+
+def _matrix(camera: Camera, eye: np.ndarray) -> np.ndarray:
+    """As in ``Source``."""
+    right, up, back = camera.camera_to_world[:3, :3].T
+    rows = np.stack([camera.fx * right - camera.cx * back, -camera.fy * up - camera.cy * back, -back])
+    return np.concatenate([rows, -(rows @ eye)[:, None]], axis=1)
