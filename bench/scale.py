@@ -41,7 +41,8 @@ from unittest import mock
 import psutil
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT)] * (str(ROOT) not in sys.path)  # for the system below and in workers
+if sys.path[0] != str(ROOT):  # before this folder, whose files have the names of packages; for workers too
+    sys.path.insert(0, str(ROOT))
 
 from pipeline import commands, mapping  # noqa: E402
 from pipeline.config import StageConfig, count, parse  # noqa: E402
