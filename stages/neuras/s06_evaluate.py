@@ -139,7 +139,7 @@ class Evaluate(MapStage):
         }
         drawn_by = (draft.environment() or {})["opengl"]
         summary = summarise(views)
-        summary["device"] = costs.device_bytes(scene.baked, scene.atlas)
+        summary["device"] = costs.device_bytes(scene)
         summary["storage"] = costs.storage(site, scene.baked)
         timing: dict[str, Any] = {}
         missing = report.without_weights(bool(lpips_networks(config.lpips)), config.inception)

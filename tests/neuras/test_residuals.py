@@ -14,7 +14,7 @@ from PIL import Image
 from pipeline.errors import UserError
 from stages.graphics.browser import find_browser
 from stages.graphics.cameras import Camera
-from stages.neuras.baking import browser, drawing
+from stages.neuras.baking import browser, drawing, residuals
 from stages.neuras.baking.residuals import LEAST, MASKED, Residuals
 from stages.neuras.baking.site import sizes, write_site
 from stages.neuras.evaluation.renderers import Reference
@@ -163,8 +163,9 @@ def test_opengl_draws_what_torch_computes(tmp_path, monkeypatch):
         drawing.context().release()
     except UserError as error:
         pytest.skip(str(error))
-    monkeypatch.setattr(drawing, "LAYERS", 4)
+    monkeypatch.setattr(residuals, "LAYERS", 4)
     world = World(tmp_path, checkered)
+    assert world.residuals.layers == 4 < len(PLACES)
     with drawing.Drawing(world.baked, world.atlas, *RANGE, residuals=world.residuals) as scene:
         for place in [*SHOWN, SHOWN[0]]:
             truth, drawn = world.both.render(moved(place)), scene.render(moved(place))

@@ -15,7 +15,6 @@ from stages.neuras.baking.shaders import MODES, Ranges, mesh_shaders, resolve_sh
 from stages.neuras.records import AtlasMesh
 
 TextureFormat = Literal["fp16", "rgba8"]
-LAYERS = 16  # residuals on the device at a time, those of the photos that were taken last
 INSTALL = "install EGL and a driver, such as the packages libegl1 and libgl1-mesa-dri"
 
 
@@ -213,7 +212,7 @@ class _Photos:
     def __init__(self, gl: Any, residuals: Residuals):
         self._residuals = residuals
         self._layers: dict[int, int] = {}  # of photos, the one that was wanted longest ago first
-        count = min(max(LAYERS, residuals.nearest), len(residuals.eyes))
+        count = residuals.layers
         self._free = list(range(count))
         self._values = gl.texture_array((*residuals.size, count), 3, dtype="f1", alignment=1)
         self._values.filter = (gl.LINEAR, gl.LINEAR)

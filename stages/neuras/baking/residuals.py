@@ -34,7 +34,8 @@ BORDER = 0.03  # share of a photo's longer side over which it fades towards its 
 LEAST = 0.1  # share of the photos' weights below which residuals fade: none comes or goes at once
 NEUTRAL = 128  # byte of no residual
 OPEN, MASKED = 0, 65535  # codes of depth: nothing hit, and a pixel that does not count
-CACHED = 16  # sources kept in memory
+LAYERS = 8  # photos on the device at a time, those that were wanted last
+CACHED = 16  # photos kept in memory
 
 
 class Renderer(Protocol):
@@ -60,14 +61,16 @@ class Source:
 class Residuals:
     """All residuals of a site; pictures are read when they are needed. ``about``: the part "residuals" of its ``scene.json``.
 
-    nearest: photos that a view takes. angle: radians at which a residual has faded to 1/e. near, far: the distances of the
-    first and the last code of depth. size: width and height of the largest picture. eyes: (K, 3).
+    nearest: photos that a view takes. layers: photos on the device at a time. angle: radians at which a residual has faded to
+    1/e. near, far: the distances of the first and the last code of depth. size: width and height of the largest picture.
+    eyes: (K, 3).
     """
 
     def __init__(self, folder: Path, about: dict[str, Any]):
         self.about = about
         self._folder, self._sources = folder, about["sources"]
         self.nearest: int = about["nearest"]
+        self.layers: int = about["layers"]
         self.angle: float = about["angle"]
         self.near, self.far = about["near"], about["far"]
         self.soft: float = about["soft"]
@@ -109,6 +112,7 @@ class Residuals:
         near, far = depth_range
         about = {
             "nearest": min(nearest, len(sources)),
+            "layers": min(max(nearest, LAYERS), len(sources)),
             "angle": float(np.radians(angle_deg)),
             "near": near,
             "far": far,
@@ -122,6 +126,12 @@ class Residuals:
         values = np.array(Image.open(self._folder / f"{source['name']}.png").convert("RGB"))
         codes = np.array(Image.open(self._folder / f"{source['name']}.depth.png").convert("RGB")).astype(np.uint16)
         return Source(values, codes[..., 0] + 256 * codes[..., 1], np.array(source["matrix"]), np.array(source["eye"]))
+
+    @property
+    def device_bytes(self) -> int:
+        """Of both texture arrays, four bytes a pixel each."""
+        width, height = self.size
+        return 2 * 4 * width * height * self.layers
 
     def chosen(self, eye: np.ndarray) -> tuple[list[int], np.ndarray]:
         """Numbers of the photos that a view from ``eye`` (3,) takes, and their weights, which sum to 1.

@@ -21,7 +21,6 @@ from stages.neuras.baking.drawing import Drawing
 from stages.neuras.baking.shaders import textures
 from stages.neuras.evaluation.paths import framed
 from stages.neuras.evaluation.renderers import Scene
-from stages.neuras.records import AtlasMesh
 
 HALF = 2  # bytes of a half float
 
@@ -77,12 +76,14 @@ def time_shader(scene: Scene, cameras: Sequence[Camera], size: tuple[int, int]) 
     }
 
 
-def device_bytes(baked: Baked, atlas: AtlasMesh) -> dict[str, int]:
-    """Bytes on the device with half-float and with 8-bit textures, and of vertices and faces."""
+def device_bytes(scene: Scene) -> dict[str, int]:
+    """Bytes on the device with half-float and with 8-bit textures, of vertices and faces, and of residuals."""
+    baked, atlas = scene.baked, scene.atlas
     (height, width), (layers, side) = baked.mesh_size, baked.sky_size
     texels = (height * width + 6 * layers * side * side) * 4 * textures(baked.channels)
     geometry = atlas.vertices.nbytes + atlas.uvs.nbytes + atlas.faces.nbytes
-    return {"fp16": HALF * texels, "rgba8": texels, "geometry": geometry}
+    residuals = 0 if scene.residuals is None else scene.residuals.device_bytes
+    return {"fp16": HALF * texels, "rgba8": texels, "geometry": geometry, "residuals": residuals}
 
 
 def storage(folder: Path, baked: Baked) -> dict[str, Any]:

@@ -233,11 +233,15 @@ def byte_table(summary: Summary) -> Table:
     """Bytes on disk and on the device, in megabytes."""
     stored, device = summary["storage"], summary["device"]
     rows = [
-        [f"stored: geometry, textures, shaders{', codes and codebooks' if stored['quantized'] else ''}", _mb(stored["stored"])],
+        [
+            f"stored: geometry, textures, shaders, residuals{', codes and codebooks' if stored['quantized'] else ''}",
+            _mb(stored["stored"]),
+        ],
         ["the same without quantization: features as half floats", _mb(stored["without_codes"])],
         *([f"  of the site: {kind}", _mb(size)] for kind, size in stored["kinds"].items()),
         ["on the device: half-float textures and geometry", _mb(device["fp16"] + device["geometry"])],
         ["on the device: 8-bit textures and geometry", _mb(device["rgba8"] + device["geometry"])],
+        *([["on the device: residuals beside them", _mb(device["residuals"])]] if device["residuals"] else []),
     ]
     return Table(["what", "MB"], rows, numeric=True)
 

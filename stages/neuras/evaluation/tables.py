@@ -118,7 +118,7 @@ def _columns() -> dict[str, Column]:
             DISTRIBUTION_METRICS["fid"].format,
             lambda row, method, metres=metres: row.fid(metres, method),
         )
-    device = _ours_alone(lambda row: (row.summary["device"]["fp16"] + row.summary["device"]["geometry"]) / MB)
+    device = _ours_alone(lambda row: sum(row.summary["device"][of] for of in ("fp16", "geometry", "residuals")) / MB)
     columns["memory"] = Column("on the device, MB", "{:,.0f}".format, device)
     columns["stored"] = Column("stored, MB", "{:,.1f}".format, _ours_alone(lambda row: row.summary["storage"]["stored"] / MB))
     columns["fps"] = Column(

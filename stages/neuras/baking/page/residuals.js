@@ -2,19 +2,17 @@
 // camera moves; each photo has a layer of two texture arrays until another one needs it.
 import { fetched } from "./loader.js";
 
-const LAYERS = 16; // photos on the device at a time
 const LOADS = 2; // photos at a time
 const AGAIN_MS = 5000; // until a file that could not be read is tried once more
 
 export class Residuals {
   constructor(viewer) {
-    const { gl, scene } = viewer, { sources, nearest } = scene.residuals;
-    Object.assign(this, { viewer, gl, about: scene.residuals, on: true, loading: 0 });
+    const { gl, scene } = viewer, { sources, layers } = scene.residuals;
+    Object.assign(this, { viewer, gl, about: scene.residuals, layers, on: true, loading: 0 });
     this.width = Math.max(...sources.map(({ width }) => width));
     this.height = Math.max(...sources.map(({ height }) => height));
-    this.layers = Math.min(Math.max(LAYERS, nearest), sources.length);
     this.photos = sources.map((source) => ({ ...source, state: "away", layer: null, wanted: 0, again: 0, problem: null }));
-    this.free = Array.from({ length: this.layers }, (_, layer) => layer);
+    this.free = Array.from({ length: layers }, (_, layer) => layer);
     this.clock = 0;
     this.values = this.array(gl.LINEAR);
     this.depths = this.array(gl.NEAREST);
