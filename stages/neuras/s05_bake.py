@@ -83,6 +83,7 @@ class Bake(RunStage):
                 baked.sky_centre,
                 planes,
                 SOFT_M * info.metre,
+                info.radius,
                 config.residuals,
                 config.residual_angle,
                 inputs["fit"].manifest["config"].get("exposure", False),

@@ -45,7 +45,7 @@ class World:
             mask = None if masks is None else _png(np.uint8(255) * masks(picture.shape[:2], number))
             self.frames.append(FrameRecord(f"frame-drive_{number}", camera, _png(picture), "train", mask=mask))
         site.mkdir(parents=True, exist_ok=True)
-        self.residuals = Residuals.make(site, self.plain, self.frames, self.baked.sky_centre, RANGE, 0.001, nearest, angle)
+        self.residuals = Residuals.make(site, self.plain, self.frames, self.baked.sky_centre, RANGE, 0.001, 5.0, nearest, angle)
         self.both = Reference(self.baked, self.atlas, self.residuals)
         self.site = site
 
@@ -134,7 +134,7 @@ def test_exposure_is_no_part_of_a_residual(tmp_path):
         frames.append(replace(frame, picture=_png(np.rint(picture).astype(np.uint8))))
     for exposure, most in ((True, 3), (False, 100)):
         made = Residuals.make(
-            tmp_path / str(exposure), world.plain, frames, world.baked.sky_centre, RANGE, 0.001, 4, 5.0, exposure
+            tmp_path / str(exposure), world.plain, frames, world.baked.sky_centre, RANGE, 0.001, 5.0, 4, 5.0, exposure
         )
         away = np.abs(made.source(1).values.astype(int) - 128)
         assert (np.percentile(away, 99) <= most) == exposure or not exposure and np.percentile(away, 50) > 10

@@ -63,7 +63,7 @@ class Residuals:
 
     nearest: photos that a view takes. layers: photos on the device at a time. angle: radians at which a residual has faded to
     1/e. near, far: the distances of the first and the last code of depth. size: width and height of the largest picture.
-    eyes: (K, 3).
+    off_mesh: distance of what rays beside the mesh see, by which alone their angles are told. eyes: (K, 3).
     """
 
     def __init__(self, folder: Path, about: dict[str, Any]):
@@ -74,6 +74,7 @@ class Residuals:
         self.angle: float = about["angle"]
         self.near, self.far = about["near"], about["far"]
         self.soft: float = about["soft"]
+        self.off_mesh: float = about["off_mesh"]
         self.eyes = np.array([source["eye"] for source in self._sources], float).reshape(-1, 3)
         self.size = tuple(max(source[name] for source in self._sources) for name in ("width", "height"))
         self.source = functools.lru_cache(CACHED)(self._read)
@@ -93,6 +94,7 @@ class Residuals:
         centre: np.ndarray,
         depth_range: tuple[float, float],
         soft: float,
+        off_mesh: float,
         nearest: int,
         angle_deg: float,
         exposure: bool = False,
@@ -100,8 +102,8 @@ class Residuals:
         """Write the residuals of the frames' photos to a site; None where there is no photo.
 
         centre: (3,) of the skyboxes, world. depth_range: distances that codes of depth span, world units. soft: distance, world
-        units, within which photos weigh alike. exposure: whether each photo first takes the exposure of the scene's picture,
-        for scenes that were fitted so.
+        units, within which photos weigh alike. off_mesh, nearest: as of `Residuals`. exposure: whether each photo first takes
+        the exposure of the scene's picture, for scenes that were fitted so.
         """
         (site / FOLDER).mkdir(parents=True, exist_ok=True)
         sources = [
@@ -117,6 +119,7 @@ class Residuals:
             "near": near,
             "far": far,
             "soft": soft,
+            "off_mesh": off_mesh,
             "sources": sources,
         }
         return cls(site / FOLDER, about) if sources else None
@@ -153,7 +156,7 @@ class Residuals:
 
         weight: of ``chosen``. border: from 0 at a photo's outermost pixels to 1 within. agreement: of the distance that the
         photo's nearest pixel sees with the point's. r_k: the residual, bilinear. f_k = exp((cos a - 1) / (1 - cos angle)), with
-        the angle a between the two rays that see the point.
+        the angle a between the two rays that see the point; beside the mesh, a point at the distance ``off_mesh``.
         """
         hit = depth > 0
         far = np.where(hit, 1.0, 0.0)
@@ -171,11 +174,11 @@ class Residuals:
             border = np.clip(edge / (BORDER * max(width, height)), 0, 1) * ahead
             x, y = np.clip(x, 0.5, width - 0.5), np.clip(y, 0.5, height - 0.5)
             code = source.depths[np.minimum(y.astype(int), height - 1), np.minimum(x.astype(int), width - 1)]
-            away = points - source.eye
+            away = np.where(hit[:, None], points, eye + ways * self.off_mesh) - source.eye
             distance = np.maximum(np.linalg.norm(away, axis=1), 1e-12)
             same = np.clip(1.5 - np.abs(self.distance(code) - distance) / (TOLERANCE * distance), 0, 1)
             agrees = np.where(hit, same * ((code != OPEN) & (code != MASKED)), code == OPEN)
-            cosine = np.where(hit, np.einsum("ij,ij->i", away, ways) / distance, 1)
+            cosine = np.einsum("ij,ij->i", away, ways) / distance
             fade = np.exp((cosine - 1) / (1 - np.cos(self.angle)))
             share = weight * border * agrees
             total += (share * fade)[:, None] * (_bilinear(source.values, x - 0.5, y - 0.5) - NEUTRAL) / 255

@@ -230,13 +230,13 @@ vec3 residual(vec3 point, float on_mesh, vec3 way) {{  // off the mesh the point
         float border = clamp(min(inner.x, inner.y) / ({_number(residuals.BORDER)} * max(about.y, about.z)), 0.0, 1.0);
         if (border <= 0.0) continue;
         float code = dot(floor(255.0 * texelFetch(depths, ivec3(ivec2(place), int(about.w)), 0).rg + 0.5), vec2(1.0, 256.0));
-        vec3 away = point - photo_eye[k];
+        vec3 away = (on_mesh > 0.0 ? point : eye + {_number(photos.off_mesh)} * way) - photo_eye[k];
         float apart = max(length(away), 1e-12);
         float seen = {_number(photos.near)} * exp2((code - 1.0) * {_number(steps)});
         float same = clamp(1.5 - abs(seen - apart) / ({_number(residuals.TOLERANCE)} * apart), 0.0, 1.0);
         bool hit = code != {residuals.OPEN}.0 && code != {residuals.MASKED}.0;
         float agrees = on_mesh > 0.0 ? (hit ? same : 0.0) : (code == {residuals.OPEN}.0 ? 1.0 : 0.0);
-        float cosine = on_mesh > 0.0 ? dot(away, way) / apart : 1.0;
+        float cosine = dot(away, way) / apart;
         float share = about.x * border * agrees;
         vec3 value = texture(residuals, vec3(place / vec2(textureSize(residuals, 0).xy), about.w)).rgb;
         float fade = exp((cosine - 1.0) / {_number(1 - np.cos(photos.angle))});
