@@ -75,7 +75,7 @@ class Bake(RunStage):
         planes, folder = depth_range(atlas.vertices, info.metre), draft.files / "site"
         photos = None
         if config.residuals:
-            torch.set_num_threads(1)  # sums in another order round differently
+            torch.set_num_threads(1)  # of each photo: sums in another order round differently
             photos = Residuals.make(
                 folder,
                 Reference(baked, atlas),

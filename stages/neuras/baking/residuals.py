@@ -15,7 +15,9 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -106,11 +108,10 @@ class Residuals:
         the exposure of the scene's picture, for scenes that were fitted so.
         """
         (site / FOLDER).mkdir(parents=True, exist_ok=True)
-        sources = [
-            _write(site / FOLDER, scene, frame, centre, depth_range, exposure)
-            for frame in frames
-            if min(frame.camera.width, frame.camera.height) > 1  # of one row nothing is mixed
-        ]
+        mixed = [frame for frame in frames if min(frame.camera.width, frame.camera.height) > 1]  # of one row nothing is
+        write = functools.partial(_write, site / FOLDER, scene, centre, depth_range, exposure)
+        with ThreadPoolExecutor(os.cpu_count()) as threads:  # each photo by one of them, so the bytes are the same
+            sources = list(threads.map(write, mixed))
         near, far = depth_range
         about = {
             "nearest": min(nearest, len(sources)),
@@ -201,7 +202,7 @@ def _bilinear(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _write(
-    folder: Path, scene: Renderer, frame: FrameRecord, centre: np.ndarray, depth_range: tuple[float, float], exposure: bool
+    folder: Path, scene: Renderer, centre: np.ndarray, depth_range: tuple[float, float], exposure: bool, frame: FrameRecord
 ) -> dict[str, Any]:
     """Write one photo's two files; returns what ``scene.json`` says of it."""
     name, camera, counts = frame.id.removeprefix(FRAME), frame.camera, frame.counts()
