@@ -148,6 +148,17 @@ def test_the_same_photos_give_the_same_bytes(tmp_path):
     assert all((tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes() for file in files)
 
 
+def test_a_site_that_was_tampered_with_is_refused(tmp_path):
+    world = World(tmp_path / "site", half)
+    about = world.residuals.about
+    folder = tmp_path / "site" / residuals.FOLDER
+    for name in ("../frames/x", "/etc/x", "a/b", ""):
+        with pytest.raises(UserError, match="outside of its folder"):
+            Residuals(folder, about | {"sources": [about["sources"][0] | {"name": name}]})
+    with pytest.raises(UserError, match="not of the size"):
+        Residuals(folder, about | {"sources": [about["sources"][0] | {"width": 4000}]}).source(0)
+
+
 SHOWN = [(4.15, 2.8, 2.0), (4.6, 2.2, 2.2), (4.9, 1.2, 1.9), (5.1, 1.0, 2.0)]
 
 

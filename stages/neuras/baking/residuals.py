@@ -16,6 +16,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import re
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ import numpy as np
 from PIL import Image
 
 from model.neuras.exposure import matched
+from pipeline.errors import UserError
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster
 from stages.neuras.records import FRAME, FrameRecord
@@ -69,6 +71,10 @@ class Residuals:
     """
 
     def __init__(self, folder: Path, about: dict[str, Any]):
+        if not all(re.fullmatch(r"[\w-]+", source["name"]) for source in about["sources"]):
+            raise UserError(
+                f"{folder.parent / 'scene.json'} names residuals outside of its folder: it is no site that bake wrote"
+            )
         self.about = about
         self._folder, self._sources = folder, about["sources"]
         self.nearest: int = about["nearest"]
@@ -129,6 +135,10 @@ class Residuals:
         source = self._sources[number]
         values = np.array(Image.open(self._folder / f"{source['name']}.png").convert("RGB"))
         codes = np.array(Image.open(self._folder / f"{source['name']}.depth.png").convert("RGB")).astype(np.uint16)
+        if not values.shape[:2] == codes.shape[:2] == (source["height"], source["width"]):
+            raise UserError(
+                f"{self._folder / source['name']}.png is not of the size that scene.json states: bake the scene again"
+            )
         return Source(values, codes[..., 0] + 256 * codes[..., 1], np.array(source["matrix"]), np.array(source["eye"]))
 
     @property
