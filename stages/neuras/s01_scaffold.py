@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from stages.neuras.records import CaptureInfo, FrameRecord, Mesh
 
 
+SPARED = 25  # faces of a piece of a given mesh from which on it is decimated
+
+
 class ScaffoldConfig(StageConfig):
     """Lengths end in ``_m``: metres, or nominal metres where the capture's unit is unknown (``CaptureInfo.metre``)."""
 
@@ -40,6 +43,7 @@ class ScaffoldConfig(StageConfig):
     weld_m: float = Field(0.02, gt=0)  # vertices in one cell of this size become one
     faces: int | None = Field(150_000, ge=100)  # about this many after QSlim; null: all
     speck_faces: int = Field(25, ge=0)  # connected pieces of fewer faces go
+    speck_m: float = Field(0.5, ge=0)  # of a given mesh only those that are no larger: a wall may have two faces
     cull: bool = True  # drop faces that no camera sees
     cull_rays: int = Field(2, ge=1, le=4)  # rays through a pixel, in both directions
     cull_shifts_m: tuple[float, ...] = (-4.0, -2.0, 2.0, 4.0)  # virtual cameras to the right of the source cameras
@@ -48,7 +52,7 @@ class ScaffoldConfig(StageConfig):
 
 class Scaffold(MapStage):
     name: ClassVar[str] = "scaffold"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     inputs: ClassVar[tuple[str, ...]] = ("capture",)
     Config: ClassVar[Any] = ScaffoldConfig
     reasons: ClassVar[dict[str, str]] = {"empty": "no face is left: points too sparse, or cameras that see nothing of it"}
@@ -77,11 +81,11 @@ class Scaffold(MapStage):
         info = CaptureInfo.of(capture)
         views = list(frames(capture, "train"))
         mesh, source = _surface(config, capture, info, views)
-        faces = {"source": len(mesh.faces)}
+        faces, given = {"source": len(mesh.faces)}, source["source"] == "given"
         mesh = simplify.weld(mesh, config.weld_m * info.metre)
         faces["welded"] = len(mesh.faces)
         if config.faces is not None and len(mesh.faces) > config.faces:
-            mesh = simplify.collapse(mesh, config.faces)
+            mesh = simplify.collapse(mesh, config.faces, SPARED if given else 0)
         faces["collapsed"] = len(mesh.faces)
         if config.cull and len(mesh.faces):
             shifts = [shift * info.metre for shift in config.cull_shifts_m]
@@ -89,7 +93,8 @@ class Scaffold(MapStage):
             mesh = visibility.kept_faces(mesh, visibility.seen(mesh, cameras, config.cull_rays), config.cull_rings)
             faces["seen"] = len(mesh.faces)
         if len(mesh.faces):
-            mesh = simplify.without_specks(mesh, config.speck_faces)
+            largest = config.speck_m * info.metre if given else np.inf
+            mesh = simplify.without_specks(mesh, config.speck_faces, largest)
         if not len(mesh.faces):
             raise Reject("empty", f"faces after each step: {faces}")
         meta = {"source": source, "faces": faces | {"kept": len(mesh.faces)}, "vertices": len(mesh.vertices)}

@@ -125,11 +125,28 @@ def _soup(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     return mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3)
 
 
+def test_walls_of_two_faces_outlast_decimation():
+    ball = sphere(5)
+    corners = np.array([[0, 0, 0], [3, 0, 0], [3, 3, 0], [0, 3, 0]], np.float32)
+    walls = np.concatenate([corners + (5, 5, 4 * number) for number in range(300)])
+    faces = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]) + 4 * number for number in range(300)])
+    mesh = Mesh(
+        np.concatenate([ball.vertices, walls]).astype(np.float32),
+        np.concatenate([ball.faces, faces + len(ball.vertices)]).astype(np.int32),
+    )
+    small = simplify.collapse(mesh, 3000, spared=25)
+    beside = small.vertices[small.faces][:, :, 0].min(axis=1) > 4
+    assert beside.sum() == 600 and 2000 < (~beside).sum() <= 2400
+    assert len(simplify.collapse(mesh, 500, spared=25).faces) == len(mesh.faces)  # the walls alone are more
+
+
 def test_specks_go_and_bodies_stay():
     ball, chip = sphere(2), Mesh(np.eye(3, dtype=np.float32) + 9, np.array([[0, 1, 2]], np.int32))
     both = Mesh(np.concatenate([ball.vertices, chip.vertices]), np.concatenate([ball.faces, chip.faces + len(ball.vertices)]))
     assert len(simplify.without_specks(both, 5).faces) == len(ball.faces)
     assert len(simplify.without_specks(both, 1).faces) == len(both.faces)
+    assert len(simplify.without_specks(both, 5, 1.8).faces) == len(ball.faces)  # the diagonal of its box is 1.73
+    assert len(simplify.without_specks(both, 5, 1.7).faces) == len(both.faces)
 
 
 def test_culling_drops_the_far_side_and_keeps_what_cameras_beside_see():

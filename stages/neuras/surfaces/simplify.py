@@ -21,12 +21,32 @@ def weld(mesh: Mesh, distance: float) -> Mesh:
     return Mesh.compact(means, faces[np.sort(first)])
 
 
-def without_specks(mesh: Mesh, least_faces: int) -> Mesh:
-    """Without connected pieces of fewer faces: they cost a chart each and show little."""
+def without_specks(mesh: Mesh, least_faces: int, largest: float = np.inf) -> Mesh:
+    """Without connected pieces of fewer faces, but for those whose box has a longer diagonal than ``largest``.
+
+    Specks cost a chart each and show little. A wall that somebody modelled may have two faces, and is none.
+    """
+    of_vertex = measure.vertex_components(mesh.faces, len(mesh.vertices))
+    piece = of_vertex[mesh.faces[:, 0]]
+    low, high = (np.full((int(of_vertex.max(initial=0)) + 1, 3), limit) for limit in (np.inf, -np.inf))
+    np.minimum.at(low, of_vertex, mesh.vertices)
+    np.maximum.at(high, of_vertex, mesh.vertices)
+    large = np.linalg.norm(high - low, axis=1) > largest
+    return Mesh.compact(mesh.vertices, mesh.faces[(np.bincount(piece)[piece] >= least_faces) | large[piece]])
+
+
+def collapse(mesh: Mesh, target_faces: int, spared: int = 0) -> Mesh:
+    """About ``target_faces`` faces by QSlim, and more where pieces of fewer faces than ``spared`` leave no room.
+
+    Those stay as they are: QSlim moves borders at no cost, and takes one of the two faces of a modelled wall first.
+    """
     piece = measure.vertex_components(mesh.faces, len(mesh.vertices))[mesh.faces[:, 0]]
-    return Mesh.compact(mesh.vertices, mesh.faces[np.bincount(piece)[piece] >= least_faces])
-
-
-def collapse(mesh: Mesh, target_faces: int) -> Mesh:
-    """About ``target_faces`` faces by QSlim."""
-    return Mesh.compact(*decimator.collapse(mesh.vertices, mesh.faces, target_faces, "fast_simplification", 0.0))
+    small = np.bincount(piece)[piece] < spared
+    if not small.any():
+        return Mesh.compact(*decimator.collapse(mesh.vertices, mesh.faces, target_faces, "fast_simplification", 0.0))
+    kept = Mesh.compact(mesh.vertices, mesh.faces[small])
+    if small.all() or len(kept.faces) >= target_faces:
+        return mesh
+    rest = collapse(Mesh.compact(mesh.vertices, mesh.faces[~small]), target_faces - len(kept.faces))
+    vertices = np.concatenate([rest.vertices, kept.vertices])
+    return Mesh(vertices, np.concatenate([rest.faces, kept.faces + len(rest.vertices)]).astype(np.int32))
