@@ -1,6 +1,6 @@
 // Keeps those tiles of a scene on the device that lie near the camera, each at the levels that its pixels ask for. The viewer
 // knows nothing of it: it draws one mesh with one set of textures, and here both are refilled as the camera moves.
-import { expandCodes } from "./loader.js";
+import { expandCodes, fetched } from "./loader.js";
 import "./viewer.js"; // which is done when its viewer stands
 
 const LOADS = 4; // files at a time
@@ -222,9 +222,7 @@ class Tiles {
   }
 
   async fetch(name) {
-    const answer = await fetch(name);
-    if (!answer.ok) throw new Error(`${name} cannot be read (${answer.status}): is the folder complete?`);
-    const blob = await answer.blob();
+    const blob = await (await fetched(name)).blob();
     this.fetches++;
     this.fetched += blob.size;
     return blob;
