@@ -194,6 +194,12 @@ class Mesh:
         vertices, faces = measure.compact(np.asarray(vertices, np.float64), np.asarray(faces, np.int64))
         return cls(vertices.astype(np.float32), faces.astype(np.int32))
 
+    @classmethod
+    def joined(cls, first: Mesh, second: Mesh) -> Mesh:
+        """Both, the first one's faces before the second one's."""
+        vertices = np.concatenate([first.vertices, second.vertices])
+        return cls(vertices, np.concatenate([first.faces, second.faces + len(first.vertices)]).astype(np.int32))
+
 
 @dataclass(frozen=True, eq=False)
 class AtlasMesh:

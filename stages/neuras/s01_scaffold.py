@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 
 SPARED = 25  # faces of a piece of a given mesh from which on it is decimated
+NONE = (np.zeros((0, 3)), np.zeros((0, 3)))  # points and where they were seen from
+SURFEL = 1.25  # side of a surfel, in voxels: neighbours overlap a little
 
 
 class ScaffoldConfig(StageConfig):
@@ -38,6 +40,8 @@ class ScaffoldConfig(StageConfig):
     cell_m: float = added(0.2, legacy=0.2, gt=0)  # edge of the cubes that are marched through a distance field
     carve: bool = True  # drop what LiDAR beams went through
     carve_m: float = Field(0.3, gt=0)  # a beam may meet the surface so much before its end
+    # a small square at each LiDAR point that the surface passes by: leaves, wires, poles
+    surfels: bool = added(True, legacy=False)
     longest_m: float = Field(40.0, gt=0)  # longest side of a triangle of terrain, seen from above: bare ground has few points
     outlier_m: float = Field(8.0, gt=0)  # points of terrain so far above or below their neighbours go
     weld_m: float = Field(0.02, gt=0)  # vertices in one cell of this size become one
@@ -74,27 +78,38 @@ class Scaffold(MapStage):
         return config, inputs["capture"]
 
     def process(self, worker: Any, item: Item) -> Iterator[Record]:
-        from stages.neuras.records import CaptureInfo, frames
+        from stages.neuras.records import CaptureInfo, Mesh, frames
         from stages.neuras.surfaces import simplify, visibility
 
         config, capture = worker
         info = CaptureInfo.of(capture)
         views = list(frames(capture, "train"))
-        mesh, source = _surface(config, capture, info, views)
+        mesh, source, loose = _surface(config, capture, info, views)
         faces, given = {"source": len(mesh.faces)}, source["source"] == "given"
         mesh = simplify.weld(mesh, config.weld_m * info.metre)
         faces["welded"] = len(mesh.faces)
         if config.faces is not None and len(mesh.faces) > config.faces:
             mesh = simplify.collapse(mesh, config.faces, SPARED if given else 0)
         faces["collapsed"] = len(mesh.faces)
+        surfels = _surfels(config, info, mesh, loose)
         if config.cull and len(mesh.faces):
             shifts = [shift * info.metre for shift in config.cull_shifts_m]
             cameras = visibility.cameras_beside((view.camera for view in views), shifts)
-            mesh = visibility.kept_faces(mesh, visibility.seen(mesh, cameras, config.cull_rays), config.cull_rings)
-            faces["seen"] = len(mesh.faces)
+            seen = visibility.seen(Mesh.joined(mesh, surfels), cameras, config.cull_rays)
+            mesh, surfels = (
+                visibility.kept_faces(part, visible, rings)
+                for part, visible, rings in (
+                    (mesh, seen[: len(mesh.faces)], config.cull_rings),
+                    (surfels, seen[len(mesh.faces) :], 1),  # both halves of a square
+                )
+            )
+            faces["seen"] = len(mesh.faces) + len(surfels.faces)
         if len(mesh.faces):
             largest = config.speck_m * info.metre if given else np.inf
             mesh = simplify.without_specks(mesh, config.speck_faces, largest)
+        if config.surfels:
+            faces["surfels"] = len(surfels.faces)
+            mesh = Mesh.joined(mesh, surfels)
         if not len(mesh.faces):
             raise Reject("empty", f"faces after each step: {faces}")
         meta = {"source": source, "faces": faces | {"kept": len(mesh.faces)}, "vertices": len(mesh.vertices)}
@@ -108,8 +123,8 @@ class Scaffold(MapStage):
 
 def _surface(
     config: ScaffoldConfig, capture: Artifact, info: CaptureInfo, views: list[FrameRecord]
-) -> tuple[Mesh, dict[str, Any]]:
-    """The mesh to simplify, and how it came about."""
+) -> tuple[Mesh, dict[str, Any], tuple[np.ndarray, np.ndarray]]:
+    """The mesh to simplify, how it came about, and the points (P, 3) that it should hold, with where each was seen from."""
     from stages.neuras.records import given_mesh
     from stages.neuras.surfaces import reconstruct, visibility
 
@@ -122,7 +137,7 @@ def _surface(
     if source == "given":
         if given is None:
             raise UserError("scaffold.source=given, and the capture has no mesh: capture.mesh=FILE, or scaffold.source=poisson")
-        return given, {"source": "given"}
+        return given, {"source": "given"}, NONE
     points, viewers = _points(capture, views)
     if len(points) < 100:
         raise UserError(f"the capture has {len(points)} points, too few for a surface: give it a mesh (capture.mesh=FILE)")
@@ -132,7 +147,7 @@ def _surface(
     stated = {"source": source, "points": len(points)}
     if source == "terrain":
         longest, outlier = config.longest_m * info.metre, config.outlier_m * info.metre
-        return reconstruct.terrain(points, np.array(info.up), longest, outlier), stated
+        return reconstruct.terrain(points, np.array(info.up), longest, outlier), stated, NONE
     point_normals = reconstruct.normals(points, viewers, config.neighbours)
     trim = config.trim_m * info.metre
     if source == "distance_field":
@@ -143,7 +158,19 @@ def _surface(
         closed = len(mesh.faces)
         mesh = visibility.carved(mesh, *beams, config.carve_m * info.metre)
         stated["carved"] = closed - len(mesh.faces)
-    return mesh, stated
+    return mesh, stated, (points, viewers)
+
+
+def _surfels(config: ScaffoldConfig, info: CaptureInfo, mesh: Mesh, points: tuple[np.ndarray, np.ndarray]) -> Mesh:
+    """Squares at the points (P, 3) that lie a voxel and more beside the mesh, turned towards where they were seen from."""
+    from stages.graphics.geometry import measure
+    from stages.neuras.surfaces import reconstruct
+
+    voxel, (places, viewers) = config.voxel_m * info.metre, points
+    if not config.surfels or info.points != "lidar" or not len(mesh.faces):
+        places, viewers = NONE
+    beside = measure.distances(places, mesh.vertices, mesh.faces) > voxel if len(places) else np.zeros(0, bool)
+    return reconstruct.surfels(places[beside], viewers[beside], SURFEL * voxel)
 
 
 def _points(capture: Artifact, views: list[FrameRecord]) -> tuple[np.ndarray, np.ndarray]:

@@ -31,7 +31,8 @@ class BakeConfig(StageConfig):
     largest: int = Field(8192, ge=256)  # texels along a side that devices are expected to take
     tile_m: float | None = added(None, legacy=None, gt=0)  # side of tiles that the page loads as one drives; None: one piece
     residuals: int = added(4, legacy=0, ge=0)  # nearest training photos whose residuals a view adds; 0: none
-    residual_angle: float = added(5.0, legacy=5.0, gt=0, lt=90)  # degrees between two rays at which a residual has faded to 1/e
+    # degrees between two rays at which a residual has faded to 1/e; null: found on validation frames, else 5
+    residual_angle: float | None = added(None, legacy=5.0, gt=0, lt=90)
     reach_m: float = added(200.0, legacy=200.0, gt=0)  # how far from the camera it loads them
 
 
@@ -51,7 +52,7 @@ class Bake(RunStage):
         from model.neuras.baked import Baked
         from stages.neuras.baking import site
         from stages.neuras.baking.drawing import depth_range
-        from stages.neuras.baking.residuals import Residuals
+        from stages.neuras.baking.residuals import ANGLES, Residuals
         from stages.neuras.baking.tiles import Tiling, cut
         from stages.neuras.evaluation.renderers import Reference
         from stages.neuras.records import CaptureInfo, fitted_poses, frames, load_atlas, posed
@@ -73,21 +74,25 @@ class Bake(RunStage):
             tiling = Tiling(config.tile_m * info.metre, config.reach_m * info.metre, config.largest)
             tiles = cut(atlas, baked.pyramid, info.up, [view.camera for view in shown], tiling)
         planes, folder = depth_range(atlas.vertices, info.metre), draft.files / "site"
-        photos = None
+        photos, summary = None, {}
         if config.residuals:
             torch.set_num_threads(1)  # of each photo: sums in another order round differently
+            scene, exposure = Reference(baked, atlas), inputs["fit"].manifest["config"].get("exposure", False)
             photos = Residuals.make(
                 folder,
-                Reference(baked, atlas),
+                scene,
                 (view for view in views if view.split == "train"),
                 baked.sky_centre,
                 planes,
                 SOFT_M * info.metre,
                 info.radius,
                 config.residuals,
-                config.residual_angle,
-                inputs["fit"].manifest["config"].get("exposure", False),
+                config.residual_angle or ANGLES[0],
+                exposure,
             )
+            if photos and config.residual_angle is None:
+                held_out = [view for view in views if view.split == "validation"]
+                summary["residual_angle"] = photos.fit_angle(scene, held_out, baked.sky_centre, exposure) or ANGLES[0]
         sizes = site.write_site(folder, baked, atlas, info, shown, planes, config.textures, tiles, photos)
-        draft.note("summary", {"megabytes": {kind: round(size / 1e6, 3) for kind, size in sizes.items()}})
+        draft.note("summary", summary | {"megabytes": {kind: round(size / 1e6, 3) for kind, size in sizes.items()}})
         return sorted(path.relative_to(draft.files).as_posix() for path in draft.files.rglob("*") if path.is_file())

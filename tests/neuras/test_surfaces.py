@@ -11,7 +11,9 @@ from stages.graphics.casting import Caster
 from stages.graphics.geometry import measure
 from stages.neuras.rasterizing.footprints import footprint
 from stages.neuras.rasterizing.texels import sheet, texels
-from stages.neuras.records import Mesh
+from stages.neuras.records import CaptureInfo, Mesh
+from stages.neuras.s01_scaffold import ScaffoldConfig
+from stages.neuras.s01_scaffold import _surfels as scaffold_surfels
 from stages.neuras.surfaces import planar, reconstruct, simplify, unfold, visibility
 from tests.neuras import scenes
 
@@ -174,6 +176,41 @@ def test_what_beams_went_through_is_not_there():
     assert len(left.faces) == len(both.faces) - 1 and left.vertices[:, 0].min() > 4
     stopped = np.where((np.arange(len(ends)) % 5 < 3)[:, None], ends * 2 / 4.95, ends)  # most beams end at the sheet
     assert len(visibility.carved(both, stopped, np.zeros_like(ends), 0.3).faces) == len(both.faces)
+
+
+def test_a_surfel_is_a_square_about_its_point_and_faces_its_viewer():
+    rng = np.random.default_rng(3)
+    points, viewers = rng.normal(size=(20, 3)), rng.normal(size=(20, 3)) * 5
+    viewers[:3] = points[:3] + 4 * np.eye(3)  # along the axes too
+    squares = reconstruct.surfels(points, viewers, 0.2)
+    corners = squares.vertices.reshape(20, 4, 3)
+    assert np.allclose(corners.mean(axis=1), points, atol=1e-5)
+    assert np.allclose(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2), 0.2, atol=1e-5)
+    assert np.allclose(measure.face_areas(squares.vertices, squares.faces), 0.02, rtol=1e-4)
+    towards = (viewers - points) / np.linalg.norm(viewers - points, axis=1, keepdims=True)
+    normals = measure.face_vectors(squares.vertices.astype(float), squares.faces)
+    cosines = np.einsum("ij,ij->i", normals, np.repeat(towards, 2, axis=0)) / np.linalg.norm(normals, axis=1)
+    assert np.allclose(cosines, 1, atol=1e-4)
+    assert not len(reconstruct.surfels(points[:0], viewers[:0], 0.2).faces)
+
+
+@pytest.mark.parametrize(("surfels", "points"), [(True, "lidar"), (False, "lidar"), (True, "sfm")])
+def test_points_that_the_surface_passes_by_become_surfels(surfels, points):
+    """A wire over a ground: LiDAR's alone, since points from photos may be anywhere."""
+    ground = Mesh(
+        np.array([[-5, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0]], np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    )
+    rng = np.random.default_rng(0)
+    on_ground = np.column_stack([rng.uniform(-4, 4, (300, 2)), rng.normal(0, 0.02, 300)])
+    wire = np.column_stack([np.linspace(-4, 4, 50), np.zeros(50), np.full(50, 3.0)])
+    places = np.concatenate([on_ground, wire])
+    info = CaptureInfo("metre", 2.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 5.0, points, "every other")
+    config = ScaffoldConfig(voxel_m=0.08, surfels=surfels)
+    found = scaffold_surfels(config, info, ground, (places, places + [0.0, -9.0, 0.0]))
+    if not surfels or points != "lidar":
+        assert not len(found.faces)
+        return
+    assert np.allclose(found.vertices.reshape(-1, 4, 3).mean(axis=1), wire, atol=1e-5)
 
 
 def test_pixels_per_unit_grow_as_the_camera_comes_nearer():

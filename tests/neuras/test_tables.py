@@ -44,10 +44,15 @@ def test_rows_differ_in_what_they_say_alone(jobs):
         return {name: [config[name] for config in configs] for name in configs[0] if len({str(c[name]) for c in configs}) > 1}
 
     for table in ("table1", "table2", "table3", "table4"):
-        fits = {row: key for row, key in keys(table, "fit").items() if row != "residuals"}
-        assert len(set(keys(table, "atlas").values())) == 1 and len(set(fits.values())) == len(fits)
-    assert keys("table1", "fit")["residuals"] == keys("table1", "fit")["ours"]
-    assert differ("table1", "bake") == {"residuals": [0, 0, 4]}
+        atlases = {key for row, key in keys(table, "atlas").items() if row != "extended"}
+        assert len(atlases) == 1 and len(set(keys(table, "fit").values())) == len(jobs[table])
+    for table in ("table1", "limits"):
+        assert [row for row, job in jobs[table].items() if job.plan["bake"].config.residuals] == ["extended"]
+        assert [row for row, job in jobs[table].items() if job.plan["scaffold"].config.surfels] == ["extended"]
+    assert differ("limits", "fit") == {
+        "texture_levels": [3, 3, 3, 1, 3, 3, 3], "near_opacity": [0.12] * 4 + [0.5, 0.12, 0.12],
+        "skyboxes": [6] * 5 + [1, 6], "sky_near_m": [150.0] * 5 + [2400.0, 150.0], "direction_noise": [0.0] * 6 + [0.08]
+    }  # fmt: skip
     assert differ("table3", "fit") == {
         "layers": [3, 3, 0], "channels": [12, 12, 4], "view_direction": [True, False, True]
     }  # fmt: skip
@@ -63,7 +68,8 @@ def test_rows_differ_in_what_they_say_alone(jobs):
     assert jobs["table2"]["ours"].plan["capture"].config.preset == "drone"
     # one street, one fit, however many tables show it
     (same,) = {jobs[t][r].keys["evaluate"] for t, r in (("table1", "ours"), ("table3", "full"), ("table4", "with_vq"))}
-    assert jobs["table6"]["poisson"].keys["evaluate"] == same
+    assert jobs["table6"]["poisson"].keys["evaluate"] == jobs["limits"]["ours"].keys["evaluate"] == same
+    assert jobs["table1"]["extended"].keys["evaluate"] == jobs["limits"]["extended"].keys["evaluate"]
     assert jobs["table3"]["no_mlp"].keys["evaluate"] == jobs["table1"]["plain"].keys["evaluate"]
 
 
@@ -126,6 +132,7 @@ def test_the_page_holds_ours_beside_the_published_and_what_differs(tmp_path, mon
     assert table["ours"]["published"]["psnr"] == 25.45 and "gain" not in table["ours"]
     plain = table["plain colours"]
     assert plain["gain"]["mean"] == pytest.approx(-0.5) and plain["gain"]["high"] == pytest.approx(-0.5)  # paired
+    assert plain["gain_3"]["mean"] == pytest.approx(-0.5) and table["multi-view warping"]["gain_3"] is not None
     assert plain["ours"]["psnr_3"]["mean"] == pytest.approx(19.0)
     warping = table["multi-view warping"]
     assert warping["ours"]["psnr"]["mean"] == pytest.approx(27.5) and "fps" not in warping["ours"]

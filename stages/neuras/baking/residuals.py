@@ -17,7 +17,7 @@ import functools
 import json
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ from PIL import Image
 from model.neuras.exposure import matched
 from pipeline.errors import UserError
 from stages.graphics.cameras import Camera
-from stages.graphics.casting import Caster
+from stages.graphics.casting import Caster, GBuffer
 from stages.neuras.records import FRAME, FrameRecord
 
 FOLDER = "residuals"
@@ -40,6 +40,9 @@ NEUTRAL = 128  # byte of no residual
 OPEN, MASKED = 0, 65535  # codes of depth: nothing hit, and a pixel that does not count
 LAYERS = 8  # photos on the device at a time, those that were wanted last
 CACHED = 16  # photos kept in memory
+ANGLES = (5.0, 10.0, 20.0, 40.0)  # degrees that are tried
+WORTH = 0.1  # dB by which a larger angle must be better: beside the photos a small one harms least
+JUDGED = 4  # held-out frames that are looked at, at most
 
 
 class Renderer(Protocol):
@@ -48,6 +51,8 @@ class Renderer(Protocol):
     caster: Caster
 
     def render(self, camera: Camera) -> np.ndarray: ...
+
+    def shade(self, camera: Camera, view: GBuffer) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +135,40 @@ class Residuals:
             "sources": sources,
         }
         return cls(site / FOLDER, about) if sources else None
+
+    def fit_angle(
+        self, scene: Renderer, frames: Sequence[FrameRecord], centre: np.ndarray, exposure: bool = False
+    ) -> float | None:
+        """Take the least of ``ANGLES`` that shows held-out frames as well as any, and return it in degrees.
+
+        Photos of a drive are a degree or two apart, those of a flight ten and more. None, and nothing changes, without frames.
+        centre: (3,) of the skyboxes, world. exposure: whether pictures take the photos' exposure before they are compared.
+        """
+        every = -(-len(frames) // JUDGED)
+        if not every:
+            return None
+        errors = np.array([self._errors(scene, frame, centre, exposure) for frame in frames[::every]])
+        mean_psnr = -10 * np.log10(np.maximum(errors, 1e-10)).mean(axis=0)
+        chosen = ANGLES[int(np.argmax(mean_psnr >= mean_psnr.max() - WORTH))]
+        self.angle = self.about["angle"] = float(np.radians(chosen))
+        return chosen
+
+    def _errors(self, scene: Renderer, frame: FrameRecord, centre: np.ndarray, exposure: bool) -> list[float]:
+        """Mean squared error of a view, one ray a pixel, with each of ``ANGLES``."""
+        camera, photo, counts = frame.camera, frame.image(), frame.counts()
+        view = scene.caster.view(camera)
+        plain, eye = scene.shade(camera, view), camera.position - centre
+        ways, depth = camera.directions().reshape(-1, 3), view.depth.ravel().astype(float)
+        errors = []
+        for angle in ANGLES:
+            self.angle = float(np.radians(angle))
+            colours = np.clip(plain + self.at(eye, ways, depth).reshape(plain.shape), 0, 1)
+            picture = np.rint(255 * colours).astype(np.uint8)
+            if exposure:
+                picture = matched(picture, photo, counts)
+            difference = (picture.astype(float) - photo)[counts] / 255
+            errors.append(float(np.square(difference).mean()) if difference.size else 0.0)
+        return errors
 
     def _read(self, number: int) -> Source:
         source = self._sources[number]

@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 ALL = "paper"  # stands for all of the tables
 BETWEEN = "between frames"  # the group of views that tables are of
 SHIFTS = (2, 3)  # metres beside the lane
+GAINS = {  # name: metres beside the lane, and the column's heading
+    "gain": (0, "PSNR against the first row"),
+    "gain_3": (3, "PSNR at 3 m against the first row"),
+}
 MB = 1e6
 
 
@@ -59,6 +63,13 @@ class Made:
     def held_out(self) -> list[Mapping[str, Any]]:
         """What is known of each view that the tables are of."""
         return [view for view in self.summary["per_view"] if view["split"] == "test"]
+
+    def beside(self, metres: float) -> list[Mapping[str, Any]]:
+        """The same of the views so far beside the lane; at 0 those between frames."""
+        views = self.summary["per_view"]
+        return (
+            [view for view in views if view["split"] == "shift" and abs(view["shift"]) == metres] if metres else self.held_out
+        )
 
     def picture(self, id: str, name: str) -> bytes:
         """A view's PNG: the photo, or a method's."""
@@ -219,7 +230,8 @@ def gather(table: PaperTable, found: Mapping[str, Made], jobs: Mapping[str, Job]
             entry["ours"] = {name: value for name, value in values.items() if value is not None}
             entry["evaluate"] = result.evaluated.key
             if table.paired and base is not None and row is not base:
-                entry["gain"] = gain(result, row.method, found[base.file], base.method)
+                for name, (metres, _) in GAINS.items():
+                    entry[name] = gain(result, row.method, found[base.file], base.method, metres)
         rows.append(entry)
     first = next(iter(found.values()), None)
     differs = [] if first is None else here(first, jobs[next(iter(found))])
@@ -227,14 +239,15 @@ def gather(table: PaperTable, found: Mapping[str, Made], jobs: Mapping[str, Job]
     return {"table": table.name, "title": table.title, "rows": rows, "differs": facts}
 
 
-def gain(row: Made, method: str, base: Made, base_method: str) -> dict[str, Any] | None:
-    """How much better in PSNR than the first row, frame by frame; None where they are not of the same frames."""
+def gain(row: Made, method: str, base: Made, base_method: str, metres: float) -> dict[str, Any] | None:
+    """How much better in PSNR than the first row, frame by frame, so far beside the lane; None where they are not of the same
+    frames."""
 
     def scores(of: Made, method: str) -> dict[str, float]:
-        return {view["id"]: view["scores"][method]["psnr"] for view in of.held_out}
+        return {view["id"]: view["scores"][method]["psnr"] for view in of.beside(metres)}
 
     ours, theirs = scores(row, method), scores(base, base_method)
-    if ours.keys() != theirs.keys() or any(row.picture(id, "photo") != base.picture(id, "photo") for id in ours):
+    if not ours or ours.keys() != theirs.keys() or any(row.picture(id, "photo") != base.picture(id, "photo") for id in ours):
         return None
     return bootstrap([[ours[id] - theirs[id]] for id in sorted(ours)])
 
@@ -287,7 +300,7 @@ def blocks(table: PaperTable, numbers: Mapping[str, Any]) -> list[Any]:
         heads.append(COLUMNS[name].heading)
         if any(name in row["published"] for row in rows):
             heads.append(Cell("published", COLUMNS[name].heading, kind="soft"))
-    paired = any(row.get("gain") for row in rows)
+    gains = [name for name in GAINS if any(row.get(name) for row in rows)]
     lines = []
     for row in rows:
         line: list[Any] = [
@@ -299,15 +312,16 @@ def blocks(table: PaperTable, numbers: Mapping[str, Any]) -> list[Any]:
             line.append(_ours(name, row.get("ours", {}).get(name)))
             if any(name in other["published"] for other in rows):
                 line.append(_published(name, row["published"].get(name)))
-        if paired:
-            line.append(_gain(row.get("gain")))
+        line += [_gain(row.get(name)) for name in gains]
         lines.append(line)
-    if paired:
-        heads.append("PSNR against the first row")
+    heads += [GAINS[name][1] for name in gains]
     out: list[Any] = [PageTable(heads, lines, numeric=True)]
     if table.note:
         out.append(Text(table.note, quiet=True))
-    out.append(PageTable(["", Cell("published", kind="soft"), "here"], numbers["differs"]))
+    if table.facts:
+        out.append(PageTable(["", Cell("published", kind="soft"), "here"], numbers["differs"]))
+    else:
+        out.append(PageTable(["", "here"], [[name, value] for name, _, value in numbers["differs"]]))
     return out
 
 

@@ -48,5 +48,4 @@ def collapse(mesh: Mesh, target_faces: int, spared: int = 0) -> Mesh:
     if small.all() or len(kept.faces) >= target_faces:
         return mesh
     rest = collapse(Mesh.compact(mesh.vertices, mesh.faces[~small]), target_faces - len(kept.faces))
-    vertices = np.concatenate([rest.vertices, kept.vertices])
-    return Mesh(vertices, np.concatenate([rest.faces, kept.faces + len(rest.vertices)]).astype(np.int32))
+    return Mesh.joined(rest, kept)
