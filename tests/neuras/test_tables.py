@@ -64,7 +64,7 @@ def test_rows_differ_in_what_they_say_alone(jobs):
         "source": ["auto", "distance_field", "auto"], "faces": [150_000, 150_000, None], "speck_faces": [25, 25, 0]
     }  # fmt: skip
     assert differ("table6", "atlas") == {"charts": ["xatlas", "planar", "planar"]}
-    assert differ("table5", "capture")["object"] == ["car", "house", "tree"]
+    assert differ("table5", "capture")["object"] == ["car", "house", "tree", "tree"]
     assert jobs["table2"]["ours"].plan["capture"].config.preset == "drone"
     # one street, one fit, however many tables show it
     (same,) = {jobs[t][r].keys["evaluate"] for t, r in (("table1", "ours"), ("table3", "full"), ("table4", "with_vq"))}

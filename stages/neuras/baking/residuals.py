@@ -41,7 +41,7 @@ OPEN, MASKED = 0, 65535  # codes of depth: nothing hit, and a pixel that does no
 LAYERS = 8  # photos on the device at a time, those that were wanted last
 CACHED = 16  # photos kept in memory
 ANGLES = (5.0, 10.0, 20.0, 40.0)  # degrees that are tried
-WORTH = 0.1  # dB by which a larger angle must be better: beside the photos a small one harms least
+HARMLESS = 0.1  # dB that the angle that is taken may cost held-out frames
 JUDGED = 4  # held-out frames that are looked at, at most
 
 
@@ -139,22 +139,29 @@ class Residuals:
     def fit_angle(
         self, scene: Renderer, frames: Sequence[FrameRecord], centre: np.ndarray, exposure: bool = False
     ) -> float | None:
-        """Take the least of ``ANGLES`` that shows held-out frames as well as any, and return it in degrees.
+        """Take the largest of ``ANGLES`` that held-out frames bear, and return it in degrees. Without frames nothing changes.
 
-        Photos of a drive are a degree or two apart, those of a flight ten and more. None, and nothing changes, without frames.
+        Photos of a drive are a degree or two apart, those of a flight ten and more. No angle is larger than the median one
+        between a frame's rays and those of the nearest photo: beyond that, frames do not tell what it does. Of the others the
+        largest serves that costs nothing, since views between photos are nearer to them than a photo that was held out.
+
         centre: (3,) of the skyboxes, world. exposure: whether pictures take the photos' exposure before they are compared.
         """
         every = -(-len(frames) // JUDGED)
         if not every:
             return None
-        errors = np.array([self._errors(scene, frame, centre, exposure) for frame in frames[::every]])
+        errors, apart = zip(*(self._judge(scene, frame, centre, exposure) for frame in frames[::every]), strict=True)
         mean_psnr = -10 * np.log10(np.maximum(errors, 1e-10)).mean(axis=0)
-        chosen = ANGLES[int(np.argmax(mean_psnr >= mean_psnr.max() - WORTH))]
+        tried = [number for number, angle in enumerate(ANGLES) if number == 0 or angle <= np.median(apart)]
+        best = mean_psnr[tried].max()
+        chosen = max(ANGLES[number] for number in tried if mean_psnr[number] >= best - HARMLESS)
         self.angle = self.about["angle"] = float(np.radians(chosen))
         return chosen
 
-    def _errors(self, scene: Renderer, frame: FrameRecord, centre: np.ndarray, exposure: bool) -> list[float]:
-        """Mean squared error of a view, one ray a pixel, with each of ``ANGLES``."""
+    def _judge(self, scene: Renderer, frame: FrameRecord, centre: np.ndarray, exposure: bool) -> tuple[list[float], float]:
+        """Of a view with one ray a pixel: the mean squared error with each of ``ANGLES``, and the median angle, in degrees,
+        between its rays and those of the nearest photos; 0 where it sees no mesh.
+        """
         camera, photo, counts = frame.camera, frame.image(), frame.counts()
         view = scene.caster.view(camera)
         plain, eye = scene.shade(camera, view), camera.position - centre
@@ -168,7 +175,11 @@ class Residuals:
                 picture = matched(picture, photo, counts)
             difference = (picture.astype(float) - photo)[counts] / 255
             errors.append(float(np.square(difference).mean()) if difference.size else 0.0)
-        return errors
+        there = depth > 0
+        away = (eye + ways[there] * depth[there, None])[:, None] - self.eyes[self.chosen(eye)[0]]
+        cosines = np.einsum("nki,ni->nk", away, ways[there]) / np.maximum(np.linalg.norm(away, axis=2), 1e-12)
+        nearest = np.arccos(np.clip(cosines.max(axis=1), -1, 1))
+        return errors, float(np.degrees(np.median(nearest))) if there.any() else 0.0
 
     def _read(self, number: int) -> Source:
         source = self._sources[number]

@@ -135,6 +135,7 @@ TABLES = (
             Row("car", "car"),
             Row("house", "house"),
             Row("tree", "tree"),
+            Row("the same tree, with surfels", "tree_surfels"),
             Row("chair", figures=_quality(33.15, 0.975, 0.036, fps=461)),
             Row("lego", figures=_quality(30.66, 0.951, 0.061, fps=461)),
             Row("chair by MobileNeRF", figures={"psnr": 34.02, "fps": 720}),
