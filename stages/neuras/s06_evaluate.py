@@ -92,8 +92,6 @@ class Evaluate(MapStage):
         return (Item(row.id, row.group) for row in rows)
 
     def open(self, config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any]) -> tuple[Examiner, Photos]:
-        from dataclasses import replace
-
         import torch
 
         from stages.neuras.evaluation.renderers import Scene
@@ -106,7 +104,6 @@ class Evaluate(MapStage):
         photos = Photos(capture, inputs["fit"])
         examiner = Examiner(
             reference,
-            None if scene.residuals is None else replace(scene, residuals=None).reference(),
             {} if environment["opengl"] is None else {kind: scene.drawing(kind) for kind in ("fp16", "rgba8")},
             warping(photos, reference, scene.info.radius, config.warping_views),
             scorers(lpips_networks(config.lpips), config.lpips_folder),

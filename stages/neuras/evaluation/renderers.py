@@ -31,21 +31,31 @@ class Reference:
         self.caster = Caster(atlas.vertices, atlas.faces)
 
     def render(self, camera: Camera) -> np.ndarray:
-        rays = (self.shade(ray, self.caster.view(ray)) for ray in camera.subpixels(self.rays))
-        return sum(rays, np.float32(0)) / np.float32(self.rays**2)
+        return self.pictures(camera)["ours"]
+
+    def pictures(self, camera: Camera) -> dict[str, np.ndarray]:
+        """ "ours", and "textures" where there are residuals: the same without them."""
+        rays = [self._parts(ray, self.caster.view(ray)) for ray in camera.subpixels(self.rays)]
+        return {name: sum((parts[name] for parts in rays), np.float32(0)) / np.float32(self.rays**2) for name in rays[0]}
 
     def shade(self, camera: Camera, view: GBuffer) -> np.ndarray:
         """One ray a pixel, of a camera whose view of the mesh is known."""
+        return self._parts(camera, view)["ours"]
+
+    def _parts(self, camera: Camera, view: GBuffer) -> dict[str, np.ndarray]:
+        """`pictures` of one ray a pixel."""
         uv = view.interpolate(self._atlas.faces, self._atlas.uvs).reshape(-1, 2)
         rays = camera.directions().reshape(-1, 3)
         covered = footprint(view, camera, self._atlas)
         looks = uv, covered.spread.reshape(-1, 2), covered.detail.ravel(), view.hit.ravel()
         colours, _ = self._baked.render(*looks, camera.position, rays)
-        if self._residuals is not None:
-            eye = camera.position - self._baked.sky_centre
-            added = self._residuals.at(eye, rays, view.depth.ravel().astype(float))
-            colours = np.clip(colours + added, 0, 1).astype(np.float32)
-        return colours.reshape(camera.height, camera.width, 3)
+        shape = (camera.height, camera.width, 3)
+        if self._residuals is None:
+            return {"ours": colours.reshape(shape)}
+        eye = camera.position - self._baked.sky_centre
+        added = self._residuals.at(eye, rays, view.depth.ravel().astype(float))
+        both = np.clip(colours + added, 0, 1).astype(np.float32)
+        return {"ours": both.reshape(shape), "textures": colours.reshape(shape)}
 
     def close(self) -> None:
         pass

@@ -58,14 +58,12 @@ class Aligner:
 
 @dataclass(frozen=True, eq=False)
 class Examiner:
-    """Draws and measures views. textures: the scene without residuals, where it has some. drawings: the baked shader by texture
-    format; empty without OpenGL. exposure: whether every picture takes the photo's exposure, found on the left half. aligner:
-    turns and shifts the view's camera until its left half agrees with the training photos; without it the camera is the
-    capture's. With either, the right half alone is scored.
+    """Draws and measures views. drawings: the baked shader by texture format; empty without OpenGL. exposure: whether every
+    picture takes the photo's exposure, found on the left half. aligner: turns and shifts the view's camera until its left half
+    agrees with the training photos; without it the camera is the capture's. With either, the right half alone is scored.
     """
 
     reference: Reference
-    textures: Reference | None
     drawings: Mapping[str, Drawing]
     warping: Warping
     scorers: Mapping[str, scores.Scorer]
@@ -79,14 +77,12 @@ class Examiner:
         known, unknown = (counts & half for half in halves(counts.shape))
         if self.aligner is not None:
             frame = replace(frame, camera=self.aligner.align(frame.camera, photo, known))
-        exact = self.reference.render(frame.camera)
+        exact = self.reference.pictures(frame.camera)
         warped, covered = self.warping.render(frame.camera)
         drawn = {kind: drawing.render(frame.camera) for kind, drawing in self.drawings.items()}
-        pictures = {"ours": as_bytes(exact), "warping": as_bytes(warped)}
+        pictures = {name: as_bytes(picture) for name, picture in (*exact.items(), ("warping", warped))}
         if drawn:
             pictures["shader"] = as_bytes(drawn["fp16"])
-        if self.textures is not None:
-            pictures["textures"] = as_bytes(self.textures.render(frame.camera))
         if self.exposure:
             pictures = {name: matched(picture, photo, known) for name, picture in pictures.items()}
         if self.exposure or self.aligner is not None:
@@ -104,7 +100,7 @@ class Examiner:
             "counted": round(float(counts.mean()), 6),
             "scores": {method: scores.score(photo, picture, counts, self.scorers) for method, picture in pictures.items()},
             "errors": errors,
-            "agreement": {kind: scores.agreement(picture, exact) for kind, picture in drawn.items()},
+            "agreement": {kind: scores.agreement(picture, exact["ours"]) for kind, picture in drawn.items()},
             "unseen_by_warping": round(float(1 - np.mean(covered)), 6),
         }
         return facts, {**pictures, "photo": photo, "difference": difference(photo, pictures["ours"], counts)}
