@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 SPARED = 25  # faces of a piece of a given mesh from which on it is decimated
 NONE = (np.zeros((0, 3)), np.zeros((0, 3)))  # points and where they were seen from
 SURFEL = 1.25  # side of a surfel, in voxels: neighbours overlap a little
+THROUGH = 10  # beams through a surfel for one that ends there: leaves let some pass, where a passer-by stood all but one do
 
 
 class ScaffoldConfig(StageConfig):
@@ -40,8 +41,8 @@ class ScaffoldConfig(StageConfig):
     cell_m: float = added(0.2, legacy=0.2, gt=0)  # edge of the cubes that are marched through a distance field
     carve: bool = True  # drop what LiDAR beams went through
     carve_m: float = Field(0.3, gt=0)  # a beam may meet the surface so much before its end
-    # a small square at each LiDAR point that the surface passes by: leaves, wires, poles
-    surfels: bool = added(True, legacy=False)
+    # at most so many small squares, at LiDAR points that the surface passes by: leaves, wires, poles
+    surfels: int = added(100_000, legacy=0, ge=0)
     longest_m: float = Field(40.0, gt=0)  # longest side of a triangle of terrain, seen from above: bare ground has few points
     outlier_m: float = Field(8.0, gt=0)  # points of terrain so far above or below their neighbours go
     weld_m: float = Field(0.02, gt=0)  # vertices in one cell of this size become one
@@ -79,19 +80,22 @@ class Scaffold(MapStage):
 
     def process(self, worker: Any, item: Item) -> Iterator[Record]:
         from stages.neuras.records import CaptureInfo, Mesh, frames
-        from stages.neuras.surfaces import simplify, visibility
+        from stages.neuras.surfaces import reconstruct, simplify, visibility
 
         config, capture = worker
         info = CaptureInfo.of(capture)
         views = list(frames(capture, "train"))
-        mesh, source, loose = _surface(config, capture, info, views)
+        mesh, source, beams = _surface(config, capture, info, views)
         faces, given = {"source": len(mesh.faces)}, source["source"] == "given"
+        largest = config.speck_m * info.metre if given else np.inf
         mesh = simplify.weld(mesh, config.weld_m * info.metre)
         faces["welded"] = len(mesh.faces)
         if config.faces is not None and len(mesh.faces) > config.faces:
             mesh = simplify.collapse(mesh, config.faces, SPARED if given else 0)
         faces["collapsed"] = len(mesh.faces)
-        surfels = _surfels(config, info, mesh, loose)
+        if config.surfels and len(mesh.faces):  # before surfels are, since specks would take their places
+            mesh = simplify.without_specks(mesh, config.speck_faces, largest)
+        surfels = _surfels(config, info, mesh, *beams)
         if config.cull and len(mesh.faces):
             shifts = [shift * info.metre for shift in config.cull_shifts_m]
             cameras = visibility.cameras_beside((view.camera for view in views), shifts)
@@ -105,9 +109,9 @@ class Scaffold(MapStage):
             )
             faces["seen"] = len(mesh.faces) + len(surfels.faces)
         if len(mesh.faces):
-            largest = config.speck_m * info.metre if given else np.inf
             mesh = simplify.without_specks(mesh, config.speck_faces, largest)
         if config.surfels:
+            surfels = reconstruct.nearest_surfels(surfels, [view.camera.position for view in views], config.surfels)
             faces["surfels"] = len(surfels.faces)
             mesh = Mesh.joined(mesh, surfels)
         if not len(mesh.faces):
@@ -124,7 +128,8 @@ class Scaffold(MapStage):
 def _surface(
     config: ScaffoldConfig, capture: Artifact, info: CaptureInfo, views: list[FrameRecord]
 ) -> tuple[Mesh, dict[str, Any], tuple[np.ndarray, np.ndarray]]:
-    """The mesh to simplify, how it came about, and the points (P, 3) that it should hold, with where each was seen from."""
+    """The mesh to simplify, how it came about, and the points (P, 3) that it should hold, with where each was seen from: none
+    where the mesh is not of LiDAR's."""
     from stages.neuras.records import given_mesh
     from stages.neuras.surfaces import reconstruct, visibility
 
@@ -158,19 +163,27 @@ def _surface(
         closed = len(mesh.faces)
         mesh = visibility.carved(mesh, *beams, config.carve_m * info.metre)
         stated["carved"] = closed - len(mesh.faces)
-    return mesh, stated, (points, viewers)
+    return mesh, stated, beams if info.points == "lidar" else NONE
 
 
-def _surfels(config: ScaffoldConfig, info: CaptureInfo, mesh: Mesh, points: tuple[np.ndarray, np.ndarray]) -> Mesh:
-    """Squares at the points (P, 3) that lie a voxel and more beside the mesh, turned towards where they were seen from."""
+def _surfels(config: ScaffoldConfig, info: CaptureInfo, mesh: Mesh, points: np.ndarray, sensors: np.ndarray) -> Mesh:
+    """Squares at the points (P, 3) that lie a voxel and more beside the mesh, turned to their ``sensors`` (P, 3)."""
     from stages.graphics.geometry import measure
-    from stages.neuras.surfaces import reconstruct
+    from stages.neuras.surfaces import reconstruct, visibility
 
-    voxel, (places, viewers) = config.voxel_m * info.metre, points
-    if not config.surfels or info.points != "lidar" or not len(mesh.faces):
-        places, viewers = NONE
-    beside = measure.distances(places, mesh.vertices, mesh.faces) > voxel if len(places) else np.zeros(0, bool)
-    return reconstruct.surfels(places[beside], viewers[beside], SURFEL * voxel)
+    voxel = config.voxel_m * info.metre
+    if not config.surfels or not len(points) or not len(mesh.faces):
+        return reconstruct.surfels(*NONE, voxel)
+    places, viewers = reconstruct.thin(points, voxel, sensors)
+    beside = measure.distances(places, mesh.vertices, mesh.faces) > voxel
+    beside &= np.linalg.norm(viewers - places, axis=1) > voxel  # the sensor's own place is no surface
+    squares = reconstruct.surfels(places[beside], viewers[beside], SURFEL * voxel)
+    if config.carve and len(squares.faces):
+        counts = visibility.beams_at(squares, points, sensors, config.carve_m * info.metre)
+        passed, stopped = (of_face.reshape(-1, 2).sum(axis=1) for of_face in counts)
+        solid = passed <= THROUGH * np.maximum(stopped, 1)
+        squares = reconstruct.surfels(places[beside][solid], viewers[beside][solid], SURFEL * voxel)
+    return squares
 
 
 def _points(capture: Artifact, views: list[FrameRecord]) -> tuple[np.ndarray, np.ndarray]:

@@ -80,6 +80,9 @@ class Atlas(MapStage):
         index = int(item.id.removeprefix("tile_"))
         by = unfold if config.charts == "xatlas" else planar
         tile = by.unfold(mesh, tiles[index], densities[index], config.padding)
+        left = tile.charts < 0
+        if left.any() and not left.all():  # slivers: the others do without them
+            tile = by.unfold(mesh, tiles[index][~left], densities[index], config.padding)
         if (tile.charts < 0).any():
             raise Reject("not_unfolded", f"{int((tile.charts < 0).sum())} of {len(tile.charts)} faces")
         yield Record(item.id, {"tile.npz": pack_arrays({name: np.asarray(value) for name, value in vars(tile).items()})})

@@ -162,7 +162,17 @@ def test_the_angle_is_the_largest_that_held_out_frames_bear(tmp_path):
             held_out.append(FrameRecord(f"frame-drive_{len(held_out)}", moved(place), _png(picture), "validation"))
         assert world.residuals.fit_angle(world.plain, held_out, world.baked.sky_centre) == expected
         assert world.residuals.about["angle"] == world.residuals.angle == pytest.approx(np.radians(expected))
-    assert world.residuals.fit_angle(world.plain, [], world.baked.sky_centre) is None
+    camera = held_out[0].camera
+    away = Camera(*list(vars(camera).values())[:6], camera.camera_to_world @ np.diag([-1.0, 1, -1, 1]))
+    masked = replace(held_out[0], mask=_png(np.zeros((64, 96), np.uint8)))
+    blind = [replace(held_out[0], camera=away), masked]  # they see no mesh, or nothing that counts
+    assert not world.plain.caster.view(away).hit.any()
+    world.residuals.fit_angle(world.plain, held_out, world.baked.sky_centre)
+    before = world.residuals.angle
+    assert world.residuals.fit_angle(world.plain, blind + held_out, world.baked.sky_centre) == np.degrees(before)
+    for none in ([], blind):
+        assert world.residuals.fit_angle(world.plain, none, world.baked.sky_centre) is None
+    assert world.residuals.angle == before
 
 
 def test_the_same_photos_give_the_same_bytes(tmp_path):

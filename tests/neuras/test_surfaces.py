@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from pipeline.stage import Item
+from stages.graphics.arrays import unpack_arrays
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster
 from stages.graphics.geometry import measure
@@ -14,6 +16,7 @@ from stages.neuras.rasterizing.texels import sheet, texels
 from stages.neuras.records import CaptureInfo, Mesh
 from stages.neuras.s01_scaffold import ScaffoldConfig
 from stages.neuras.s01_scaffold import _surfels as scaffold_surfels
+from stages.neuras.s03_atlas import Atlas, AtlasConfig
 from stages.neuras.surfaces import planar, reconstruct, simplify, unfold, visibility
 from tests.neuras import scenes
 
@@ -194,23 +197,39 @@ def test_a_surfel_is_a_square_about_its_point_and_faces_its_viewer():
     assert not len(reconstruct.surfels(points[:0], viewers[:0], 0.2).faces)
 
 
-@pytest.mark.parametrize(("surfels", "points"), [(True, "lidar"), (False, "lidar"), (True, "sfm")])
-def test_points_that_the_surface_passes_by_become_surfels(surfels, points):
-    """A wire over a ground: LiDAR's alone, since points from photos may be anywhere."""
-    ground = Mesh(
-        np.array([[-5, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0]], np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    )
+def test_points_that_the_surface_passes_by_become_surfels():
+    """A wire over a ground. Where somebody stood once, and all other beams went through, nothing is left."""
+    corners = np.array([[-5, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0]], np.float32)
+    ground = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
     rng = np.random.default_rng(0)
     on_ground = np.column_stack([rng.uniform(-4, 4, (300, 2)), rng.normal(0, 0.02, 300)])
     wire = np.column_stack([np.linspace(-4, 4, 50), np.zeros(50), np.full(50, 3.0)])
     places = np.concatenate([on_ground, wire])
-    info = CaptureInfo("metre", 2.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 5.0, points, "every other")
-    config = ScaffoldConfig(voxel_m=0.08, surfels=surfels)
-    found = scaffold_surfels(config, info, ground, (places, places + [0.0, -9.0, 0.0]))
-    if not surfels or points != "lidar":
-        assert not len(found.faces)
-        return
-    assert np.allclose(found.vertices.reshape(-1, 4, 3).mean(axis=1), wire, atol=1e-5)
+    sensors = places + [0.0, -9.0, 0.0]
+    sensors[:300] = [0.0, -9.0, 4.0]
+    passer_by, sensor = np.array([1.0, -3.0, 1.5]), np.array([1.0, -3.0, 5.0])
+    below = np.repeat([[1.0, -3.0, 0.0]], 30, axis=0)  # of other turns
+    points = np.concatenate([places, [passer_by], below])
+    seen_from = np.concatenate([sensors, [sensor], np.repeat([sensor], 30, axis=0)])
+    info = CaptureInfo("metre", 2.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 5.0, "lidar", "every other")
+
+    def centres(**settings) -> np.ndarray:
+        found = scaffold_surfels(ScaffoldConfig(voxel_m=0.08, **settings), info, ground, points, seen_from)
+        return found.vertices.reshape(-1, 4, 3).mean(axis=1)
+
+    assert np.allclose(centres(), wire, atol=1e-5)
+    assert np.allclose(centres(carve=False), np.concatenate([wire, [passer_by]]), atol=1e-5)
+    assert not len(centres(surfels=0))
+    at_sensor = scaffold_surfels(ScaffoldConfig(), info, ground, np.array([[0.0, 0.0, 2.0]]), np.array([[0.0, 0.0, 2.0]]))
+    assert not len(at_sensor.faces)
+
+
+def test_of_too_many_surfels_the_nearest_stay():
+    points = np.column_stack([np.arange(10.0), np.zeros(10), np.zeros(10)])
+    squares = reconstruct.surfels(points, points + [0, 0, 1.0], 0.1)
+    few = reconstruct.nearest_surfels(squares, [np.array([0.0, 0, 0]), np.array([9.0, 0, 0])], 4)
+    assert np.allclose(few.vertices.reshape(-1, 4, 3).mean(axis=1)[:, 0], [0, 1, 8, 9], atol=1e-6)
+    assert reconstruct.nearest_surfels(squares, [np.zeros(3)], 10) is squares
 
 
 def test_pixels_per_unit_grow_as_the_camera_comes_nearer():
@@ -263,6 +282,20 @@ def test_a_fixed_size_is_kept_and_holds_all(atlas):
     parts = [unfold.unfold(mesh, rows, 60.0, 2) for rows in unfold.tiles(mesh, 400)]
     flat = unfold.pack(parts, 2, size=256)
     assert (flat.width, flat.height) == (256, 256) and flat.uvs.max() <= 1
+
+
+def test_a_sliver_costs_itself_and_not_its_tile():
+    ball = sphere()
+    line = np.array([[0, 0, 3], [1, 0, 3], [2, 0, 3]], np.float32)
+    last = len(ball.vertices)
+    mesh = Mesh(
+        np.concatenate([ball.vertices, line]), np.concatenate([[[last, last + 1, last + 2]], ball.faces]).astype(np.int32)
+    )
+    rows = np.arange(len(mesh.faces))
+    assert (unfold.unfold(mesh, rows, 20.0, 2).charts < 0).sum() == 1
+    (record,) = Atlas().process((AtlasConfig(), mesh, [rows], [20.0]), Item("tile_0000"))
+    tile = unpack_arrays(record.members["tile.npz"])
+    assert (tile["charts"] >= 0).all() and tile["source"].tolist() == rows[1:].tolist()
 
 
 def test_what_covers_itself_gets_charts_of_its_own():

@@ -168,3 +168,12 @@ def test_a_single_table_and_what_is_wrong_with_an_order(tmp_path, monkeypatch):
         tables.write(Order("table4", None, ["fit.codes=64"], tmp_path))
     with pytest.raises(UserError, match="one value"):
         tables.write(Order("table4", None, ["fit.steps=1,2"], tmp_path))
+
+
+def test_a_row_of_residuals_that_nobody_made_is_a_dash(tmp_path, monkeypatch):
+    """With bake.residuals=0 no picture is without residuals."""
+    results = {"limits/ours": made("a", 0.0, 40_000), "limits/extended": made("b", 0.5, 40_000)}
+    found = written(tmp_path, monkeypatch, results, "limits")["limits"]
+    without, both = (found[label] for label in list(found)[1:3])
+    assert without["method"] == "textures" and without["gain"] is None and "psnr" not in without["ours"]
+    assert both["gain"]["mean"] == pytest.approx(0.5)

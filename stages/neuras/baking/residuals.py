@@ -139,7 +139,8 @@ class Residuals:
     def fit_angle(
         self, scene: Renderer, frames: Sequence[FrameRecord], centre: np.ndarray, exposure: bool = False
     ) -> float | None:
-        """Take the largest of ``ANGLES`` that held-out frames bear, and return it in degrees. Without frames nothing changes.
+        """Take the largest of ``ANGLES`` that held-out frames bear, and return it in degrees. Without frames that see the mesh
+        nothing changes.
 
         Photos of a drive are a degree or two apart, those of a flight ten and more. No angle is larger than the median one
         between a frame's rays and those of the nearest photo: beyond that, frames do not tell what it does. Of the others the
@@ -147,9 +148,10 @@ class Residuals:
 
         centre: (3,) of the skyboxes, world. exposure: whether pictures take the photos' exposure before they are compared.
         """
-        every = -(-len(frames) // JUDGED)
-        if not every:
+        frames = [frame for frame in frames if frame.counts().any() and scene.caster.view(frame.camera).hit.any()]
+        if not frames:
             return None
+        every = -(-len(frames) // JUDGED)
         errors, apart = zip(*(self._judge(scene, frame, centre, exposure) for frame in frames[::every]), strict=True)
         mean_psnr = -10 * np.log10(np.maximum(errors, 1e-10)).mean(axis=0)
         tried = [number for number, angle in enumerate(ANGLES) if number == 0 or angle <= np.median(apart)]
@@ -160,7 +162,7 @@ class Residuals:
 
     def _judge(self, scene: Renderer, frame: FrameRecord, centre: np.ndarray, exposure: bool) -> tuple[list[float], float]:
         """Of a view with one ray a pixel: the mean squared error with each of ``ANGLES``, and the median angle, in degrees,
-        between its rays and those of the nearest photos; 0 where it sees no mesh.
+        between its rays and those of the nearest photos, whether these see the same or not.
         """
         camera, photo, counts = frame.camera, frame.image(), frame.counts()
         view = scene.caster.view(camera)
@@ -173,13 +175,12 @@ class Residuals:
             picture = np.rint(255 * colours).astype(np.uint8)
             if exposure:
                 picture = matched(picture, photo, counts)
-            difference = (picture.astype(float) - photo)[counts] / 255
-            errors.append(float(np.square(difference).mean()) if difference.size else 0.0)
+            errors.append(float(np.square((picture.astype(float) - photo)[counts] / 255).mean()))
         there = depth > 0
         away = (eye + ways[there] * depth[there, None])[:, None] - self.eyes[self.chosen(eye)[0]]
         cosines = np.einsum("nki,ni->nk", away, ways[there]) / np.maximum(np.linalg.norm(away, axis=2), 1e-12)
         nearest = np.arccos(np.clip(cosines.max(axis=1), -1, 1))
-        return errors, float(np.degrees(np.median(nearest))) if there.any() else 0.0
+        return errors, float(np.degrees(np.median(nearest)))
 
     def _read(self, number: int) -> Source:
         source = self._sources[number]

@@ -244,7 +244,7 @@ def gain(row: Made, method: str, base: Made, base_method: str, metres: float) ->
     frames."""
 
     def scores(of: Made, method: str) -> dict[str, float]:
-        return {view["id"]: view["scores"][method]["psnr"] for view in of.beside(metres)}
+        return {view["id"]: view["scores"][method]["psnr"] for view in of.beside(metres) if method in view["scores"]}
 
     ours, theirs = scores(row, method), scores(base, base_method)
     if not ours or ours.keys() != theirs.keys() or any(row.picture(id, "photo") != base.picture(id, "photo") for id in ours):
@@ -357,7 +357,8 @@ def pictures(table: PaperTable, found: Mapping[str, Made]) -> list[Picture]:
         if not id or not table.paired:
             id = views[len(views) // 2]["id"]
             out.append(Picture(thumbnail(result.picture(id, "photo")), f"photo {id}"))
-        out.append(Picture(thumbnail(result.picture(id, row.method)), row.label))
+        if row.method in views[0]["scores"]:
+            out.append(Picture(thumbnail(result.picture(id, row.method)), row.label))
     return out
 
 

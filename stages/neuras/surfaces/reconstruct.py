@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
@@ -117,6 +118,16 @@ def surfels(points: np.ndarray, viewers: np.ndarray, side: float) -> Mesh:
     corners = [points + side / 2 * (a * across + b * along) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     faces = 4 * np.arange(len(points))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
     return Mesh(np.stack(corners, axis=1).reshape(-1, 3).astype(np.float32), faces.reshape(-1, 3).astype(np.int32))
+
+
+def nearest_surfels(squares: Mesh, eyes: Sequence[np.ndarray], most: int) -> Mesh:
+    """The ``most`` squares that are nearest to any of the ``eyes`` (3,), in their order."""
+    if len(squares.faces) <= 2 * most:
+        return squares
+    centres = squares.vertices[squares.faces].mean(axis=1).reshape(-1, 2, 3).mean(axis=1)
+    apart = cKDTree(np.array(eyes)).query(centres)[0]
+    kept = np.sort(np.argsort(apart, kind="stable")[:most])
+    return Mesh.compact(squares.vertices, squares.faces.reshape(-1, 2, 3)[kept].reshape(-1, 3))
 
 
 def terrain(points: np.ndarray, up: np.ndarray, longest: float, outlier: float) -> Mesh:

@@ -43,21 +43,27 @@ def carved(mesh: Mesh, points: np.ndarray, sensors: np.ndarray, slack: float, ro
     ``slack`` (world units, or 2 % of its length if that is more) before its end. Each round looks behind the faces that the
     one before removed.
     """
-    ways = points - sensors
-    lengths = np.linalg.norm(ways, axis=1)
-    ways = ways / np.maximum(lengths, 1e-12)[:, None]
-    near_end = np.maximum(slack, 0.02 * lengths)
     for _ in range(rounds):
-        face, _, distance = Caster(mesh.vertices, mesh.faces).cast(sensors, ways)
-        met = face >= 0
-        through = met & (distance < lengths - near_end)
-        ended = met & (np.abs(distance - lengths) <= near_end)
-        passed, stopped = (np.bincount(face[which], minlength=len(mesh.faces)) for which in (through, ended))
+        passed, stopped = beams_at(mesh, points, sensors, slack)
         empty = passed > stopped
         if not empty.any() or empty.all():
             break
         mesh = Mesh.compact(mesh.vertices, mesh.faces[~empty])
     return mesh
+
+
+def beams_at(mesh: Mesh, points: np.ndarray, sensors: np.ndarray, slack: float) -> tuple[np.ndarray, np.ndarray]:
+    """(F,) beams that go through each face, and that end at it; of each beam the first face counts. As of `carved`."""
+    ways = points - sensors
+    lengths = np.linalg.norm(ways, axis=1)
+    ways = ways / np.maximum(lengths, 1e-12)[:, None]
+    near_end = np.maximum(slack, 0.02 * lengths)
+    face, _, distance = Caster(mesh.vertices, mesh.faces).cast(sensors, ways)
+    met = face >= 0
+    through = met & (distance < lengths - near_end)
+    ended = met & (np.abs(distance - lengths) <= near_end)
+    passed, stopped = (np.bincount(face[which], minlength=len(mesh.faces)) for which in (through, ended))
+    return passed, stopped
 
 
 def pixels_per_unit(mesh: Mesh, cameras: Iterable[Camera]) -> np.ndarray:
