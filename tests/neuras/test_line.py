@@ -45,7 +45,9 @@ def test_from_nothing_to_a_page(line):
     refined = scaffold_mesh(artifact(store, "refine"))
     assert np.array_equal(mesh.vertices, refined.vertices) and np.array_equal(mesh.faces, refined.faces)
     assert set(refined_poses(artifact(store, "refine"))) in (set(), {view.id for view in views})
-    assert 500 < len(mesh.faces) <= 4100 and len(atlas.faces) == len(mesh.faces)
+    faces = artifact(store, "scaffold").manifest["summary"]["summary"]["faces"]
+    assert len(atlas.faces) == len(mesh.faces) == faces["kept"]
+    assert 500 < faces["kept"] - faces["surfels"] <= 4100 and faces["surfels"] > 100
     site = artifact(store, "bake").path / "files" / "site"
     assert {"index.html", "viewer.js", "scene.json", "geometry.glb", "mesh_codes.png"} <= {path.name for path in site.iterdir()}
 

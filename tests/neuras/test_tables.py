@@ -57,7 +57,7 @@ def test_rows_differ_in_what_they_say_alone(jobs):
         "layers": [3, 3, 0], "channels": [12, 12, 4], "view_direction": [True, False, True]
     }  # fmt: skip
     assert differ("table4", "fit") == {"codes": [1024, 0]}
-    assert differ("figure7", "scaffold") == {"faces": [190_000, 10_000, None]}
+    assert differ("figure7", "scaffold") == {"faces": [190_000, 10_000, None], "weld_m": [0.02, 0.2, 0.02]}
     assert differ("figure7", "atlas") == {"charts": ["xatlas", "xatlas", "planar"]}
     assert differ("table6", "capture") == {"true_mesh": [False, False, True]}
     assert differ("table6", "scaffold") == {
