@@ -185,7 +185,7 @@ TABLES = (
             Row("noise on the view direction", "direction_noise"),
         ),
         {},
-        "Each of the first three rows has what the one above it has, and one thing more. Every other row differs from the first "
+        "Each of the first three rows has what the one above has, and one thing more. Every other row differs from the first "
         "in one thing. Vertices that move do not make photos agree better on this street, so they stay where they are.",
     ),
 )
