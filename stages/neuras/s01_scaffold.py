@@ -182,7 +182,7 @@ def _surfels(config: ScaffoldConfig, info: CaptureInfo, mesh: Mesh, points: np.n
         counts = visibility.beams_at(squares, points, sensors, config.carve_m * info.metre)
         passed, stopped = (of_face.reshape(-1, 2).sum(axis=1) for of_face in counts)
         solid = passed <= THROUGH * np.maximum(stopped, 1)
-        squares = reconstruct.surfels(places[beside][solid], viewers[beside][solid], SURFEL * voxel)
+        squares = visibility.kept_faces(squares, np.repeat(solid, 2), 0)
     return squares
 
 
