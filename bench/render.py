@@ -324,7 +324,9 @@ class Bench:
                 continue
             if 4 * took > self.arguments.patience:  # half the error takes four times the samples
                 break
-            took, record = self.render(view, "stop", most, denoise=denoise, target_error=target)
+            took, record = self.render(
+                view, "stop", most, denoise=denoise, target_error=target, adaptive=self.arguments.adaptive
+            )
             last = found[target] = {
                 "spp": record.meta["spp"],
                 "seconds": took,
@@ -394,7 +396,9 @@ def produce(job: dict[str, Any]) -> dict[str, Any]:
     for path in map(Path, job["arrays"]):
         start = time.perf_counter()
         seed = seed_for(job["seed"], "bench/produce", path.stem)
-        settings = RenderSettings(job["resolution"], job["max_spp"], seed, job["target"], max_depth=MAX_DEPTH)
+        settings = RenderSettings(
+            job["resolution"], job["max_spp"], seed, job["target"], max_depth=MAX_DEPTH, adaptive=job["adaptive"]
+        )
         record = render_views(read_arrays(path), settings, backend, threads=job["threads"])[0]
         (Path(job["out"]) / f"{path.stem}.exr").write_bytes(encode_view(record)[view_members(record.meta["index"])[0]])
         rows.append({"seconds": time.perf_counter() - start, "spp": record.meta["spp"], "estimate": record.meta["error"]})
@@ -448,7 +452,7 @@ def judged(image: np.ndarray, truths: Sequence[Truth], seconds: float, samples: 
 
 def ours(arguments: argparse.Namespace, backend: dict, views: list[View], truths: list[Truth]) -> Production:
     with tempfile.TemporaryDirectory() as folder:
-        names = ("resolution", "max_spp", "seed", "target", "threads")
+        names = ("resolution", "max_spp", "seed", "target", "threads", "adaptive")
         job = {name: getattr(arguments, name) for name in names} | {"backend": backend["backend"], "out": folder}
         job["arrays"] = [str(view.arrays) for view in views]
         cache = Path(folder) / "kernels"
@@ -768,6 +772,7 @@ def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--cycles-patience", type=number, default=90.0, metavar="S", help="with tuned Cycles, default %(default)s"
     )
+    parser.add_argument("--adaptive", action="store_true", help="to the target errors, ours as render.adaptive has it")
     parser.add_argument("--costs", type=whole, metavar="N", help="only CPU seconds, of so many scenes")
     parser.add_argument("--caustics", action="store_true", help="with --costs: of the six views of bench/caustics.py")
     parser.add_argument(

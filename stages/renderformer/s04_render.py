@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -70,6 +70,10 @@ class Render(MapStage):
 
     def slug(self, config: RenderConfig) -> str:
         return f"{config.mode}-{config.resolution}px-{config.max_spp}spp"
+
+    def identity(self, config: RenderConfig, hash_file: Callable[[Any], str]) -> dict[str, Any]:
+        # a version of its own, so that views with even samples keep their keys
+        return {"adaptive": 2} if config.adaptive else {}
 
     def part_size(self, config: RenderConfig, inputs: Inputs) -> int:
         return 4

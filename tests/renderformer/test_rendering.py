@@ -554,7 +554,8 @@ def test_material_is_ggx_with_correlated_masking(jit):
     same = wi[2] * wo[2] > 0
     expected = np.where(same, diffuse[:, None] / np.pi * np.abs(wo[2]) + specular[:, None] * lobe, 0)
     np.testing.assert_allclose(np.array(value), expected, rtol=2e-3, atol=1e-5)
-    drawn, _ = material.sample(lobes, mi.Vector3f(wi), mi.Float(rng.random(400_000)), mi.Point2f(rng.random((2, 400_000))))
+    glossy = mi.Float(rng.random(400_000)) < lobes.specular_share
+    drawn = material.sample(lobes, mi.Vector3f(wi), glossy, mi.Point2f(rng.random((2, 400_000))))
     albedo, pdf = (np.array(part) for part in material.evaluate(lobes, mi.Vector3f(wi), drawn))
     # what the density leaves out is sent below the surface
     kept = (np.array(drawn)[2, :200_000] > 0).mean()

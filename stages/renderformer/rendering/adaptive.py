@@ -14,7 +14,7 @@ CELL = 8  # pixels along a side
 GROWTH = 2.0  # of a view's samples, at most, before the next estimate
 CELL_GROWTH = 4.0  # of a cell's
 LEAST = 1 / 8  # of the samples of the cell that has most
-AIM = 0.9  # of the target
+AIM = 0.97  # of the target
 MULTIPLE = 8  # counts are multiples of it: what a lane of the integrator takes at least
 
 

@@ -310,7 +310,7 @@ def trace_light(scene, lights, starts, material, sink, key, first, count, max_bo
             sink.take(number, vertex, slot, carried, si, wide, material, meets)
 
         # Go on by the narrow part, from here to where the camera path would have come from.
-        wo, _ = material.sample(narrow, si.wi, mi.Float(0), sampler.two(dimension + DIRECTION))
+        wo = material.sample(narrow, si.wi, narrow.specular_share > 0, sampler.two(dimension + DIRECTION))
         scattered, pdf = material.evaluate(narrow, si.wi, wo)
         direction = si.to_world(wo)
         # by the cosines of the camera path: what it scatters is the light by that to the shading normal

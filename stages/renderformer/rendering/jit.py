@@ -26,6 +26,7 @@ from stages.renderformer.rendering.caustics import PHOTONS, PORTION, SHARE, Film
 from stages.renderformer.rendering.guiding import Guide, Trail, Unguided
 from stages.renderformer.rendering.lights import SLOTS, LightTable
 from stages.renderformer.rendering.material import Material
+from stages.renderformer.rendering.primary import FirstStep, PrimaryGuide
 from stages.renderformer.rendering.sobol import Sampler, mixed
 from stages.renderformer.rendering.sums import Sums
 from stages.renderformer.rendering.surfaces import Surfaces, gatherable, mesh_of, shape_mesh
@@ -150,13 +151,14 @@ def _add(slots: list, slot: mi.Int32, value: mi.Color3f) -> list:
 
 
 @dr.syntax
-def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start, photons, guide):
+def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_filter, diffuse_start, photons, guide, primary):
     """Sums over the samples of each lane: (light slots, direct, albedo, normal, distance, hits, nearest distance, triangle).
 
     ``limits``: opaque (bounces, diffuse bounces, glossy bounces, indirect clamp on the sum over RGB). ``hide``: opaque
     bool, camera rays pass through lights. The triangle is that of the first sample, -1 where it hit nothing.
     ``diffuse_start``: the first surface is a white diffuse one, whatever its material. ``photons``: light
-    that light paths have left; what belongs to those is left out (``caustics``). ``guide`` learns, and picks directions.
+    that light paths have left; what belongs to those is left out (``caustics``). ``guide`` learns, and picks directions; so
+    does ``primary``, for first surfaces, where there are photons.
     """
     max_bounces, max_diffuse, max_glossy, clamp = limits
     slots = [mi.Color3f(0) for _ in range(SLOTS)]
@@ -173,6 +175,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
     # shares of the throughput: narrow from the first surface on; narrow at the last surface, but not at all before
     pure, theirs = mi.Color3f(1), mi.Color3f(0)
     trail = Trail.none()
+    step = FirstStep.none()
+    cell = None if primary is None else primary.cell(lanes.pixel)
 
     while done < lanes.count:
         number = lanes.first + done
@@ -213,6 +217,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         slots = _add(slots, slot, value)
         direct += dr.select(bounce <= 1, value, 0)
         guide.add(trail, value, hit & trail.further)
+        if primary is not None:
+            step = step.bring(value, bounce > 0)
 
         # Next-event estimation at surfaces; lights reflect nothing.
         surface = valid & ~on_light & (bounce < max_bounces) & (diffuse <= max_diffuse) & (glossy <= max_glossy)
@@ -228,6 +234,8 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
             slot, value = photons.meet(lanes.stream, bounce, max_bounces, si, lobes, material, picked, later)
             value = clamped(throughput * value, dr.select(later, clamp, dr.inf))
             slots = _add(slots, slot, value)
+            if primary is not None:
+                step = step.bring(value, later)
         spot = guide.at(lanes.view, si, lobes, surface)
         choice = sampler.two(dimension + LIGHT_AND_LOBE)
         lit, point = lights.sample(choice.x, sampler.two(dimension + LIGHT_POINT))
@@ -251,10 +259,19 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         slots = _add(slots, dr.gather(mi.Int32, lights.slot, lit), value)
         direct += dr.select(bounce == 0, value, 0)
         guide.add(trail, value, sampled)
+        if primary is not None:
+            step = step.bring(value, bounce > 0)
 
         # The next direction, from the material or from what was learned.
         within = sampler.two(dimension + DIRECTION)
-        wo, is_glossy = material.sample(lobes, si.wi, choice.y, within)
+        is_glossy = choice.y < lobes.specular_share
+        if primary is not None:
+            leaves = surface & (bounce == 0)
+            chain = dr.max(pure) > 0.5
+            is_glossy, within, chance, first_step = primary.leave(cell, lobes, choice.y, within, leaves, chain)
+            step = dr.select(leaves, first_step, step)
+            throughput = dr.select(surface, throughput / chance, throughput)
+        wo = material.sample(lobes, si.wi, is_glossy, within)
         wo = guide.direction(wo, spot, si, sampler.two(dimension + GUIDE), within)
         dull, bright, pdf = material.evaluate_lobes(lobes, si.wi, wo)
         scattered = dull + bright
@@ -283,6 +300,9 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
         widest = dr.select(fresh, dr.inf, widest)
         if photons is not None:
             pure, theirs = dr.select(fresh, 1, pure), dr.select(fresh, 0, theirs)
+        if primary is not None:
+            primary.add(step, fresh)
+            step = dr.select(fresh, FirstStep.none(), step)
         trail = guide.step(trail, spot, direction, arriving, fresh)
         bounce, diffuse, glossy = [dr.select(fresh, 0, count) for count in (bounce, diffuse, glossy)]
 
@@ -313,6 +333,7 @@ class JitRenderer:
         lights_visible: bool,
         guided: bool = False,
         light_paths: bool = False,
+        primary: bool = False,
     ):
         self.record, self.size, self.seed = scene, size, seed  # (height, width)
         self.pixels = size[0] * size[1]  # of a view
@@ -332,10 +353,12 @@ class JitRenderer:
             self.before_cameras = mi.load_dict({"type": "scene", "surface": seen})
         self.guided = guided and not self.light_paths  # what guiding finds best is what light paths bring
         self.guides = [Guide(scene) if self.guided else Unguided() for _ in self.passes]
+        wanted = primary and self.light_paths
+        self.primaries = [PrimaryGuide(len(scene.camera_to_world), size) if wanted else None for _ in self.passes]
 
     def learn(self, views: list[int]) -> None:
         """Guide the paths of these views from now on by what those so far have brought."""
-        for guide in self.guides:
+        for guide in (*self.guides, *filter(None, self.primaries)):
             guide.learn(views)
 
     def texel_sums(self, points: np.ndarray, normals: np.ndarray, height: float, spp: int) -> dict[str, np.ndarray]:
@@ -537,9 +560,9 @@ class JitRenderer:
         hide = dr.opaque(mi.Bool, not self.lights_visible)
         pass_key = opaque(number * 0x5851F42D)
         white = isinstance(rays, Points)
-        guide = Unguided() if white else self.guides[number]
+        guides = (Unguided(), None) if white else (self.guides[number], self.primaries[number])
         out = trace_paths(
-            self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, photons, guide
+            self.scene, table, self.material, lanes, pass_key, bounds, hide, limits.glossy_filter, white, photons, *guides
         )
         dr.eval(out)
         slots, *wide, distances, hits, nearest, triangle = out

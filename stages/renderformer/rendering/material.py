@@ -116,15 +116,14 @@ class Material:
         density = dr.lerp(dr.inv_pi * wo.z, shape * seen, lobes.specular_share)
         return dr.select(above, diffuse, 0), dr.select(above, specular, 0), dr.select(above, density, 0)
 
-    def sample(self, lobes: Lobes, wi: mi.Vector3f, choice: mi.Float, spot: mi.Point2f) -> tuple[mi.Vector3f, mi.Bool]:
-        """A direction in the shading frame, and whether the specular lobe gave it."""
+    def sample(self, lobes: Lobes, wi: mi.Vector3f, glossy: mi.Bool, spot: mi.Point2f) -> mi.Vector3f:
+        """A direction in the shading frame, by the specular lobe where ``glossy``, else by the diffuse one."""
         side = dr.select(wi.z < 0, -1, 1)
         wi = mi.Vector3f(wi.x, wi.y, wi.z * side)
-        glossy = choice < lobes.specular_share
         facets = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, lobes.alpha, True)
         normal, _ = facets.sample(wi, spot)
         wo = dr.select(glossy, mi.reflect(wi, normal), mi.warp.square_to_cosine_hemisphere(spot))
-        return mi.Vector3f(wo.x, wo.y, wo.z * side), glossy
+        return mi.Vector3f(wo.x, wo.y, wo.z * side)
 
     def _specular(self, lobes: Lobes, cosine: mi.Float) -> mi.Color3f:
         """With multiple scattering, what comes back from further bounces between facets is spread like the first."""
