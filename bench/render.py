@@ -373,9 +373,10 @@ class BuiltIn:
         return np.array(mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=spp, seed=seed))[..., :3]
 
 
-def warm_up(scene: SceneRecord, backend: dict[str, Any], threads: int) -> None:
+def warm_up(scene: SceneRecord, backend: dict[str, Any], threads: int, adaptive: bool = False) -> None:
     """Compile the kernels, which counts as start-up."""
-    render_views(scene, RenderSettings(8, 32, target_error=1e-9, max_depth=MAX_DEPTH), backend, threads=threads)
+    settings = RenderSettings(8, 32, target_error=1e-9, max_depth=MAX_DEPTH, adaptive=adaptive)
+    render_views(scene, settings, backend, threads=threads)
 
 
 # --- whole processes --------------------------------------------------------------------------------------------------
@@ -391,7 +392,7 @@ def produce(job: dict[str, Any]) -> dict[str, Any]:
     backend on."""
     began = time.perf_counter()
     backend = backends.choose(job["backend"])
-    warm_up(read_arrays(Path(job["arrays"][0])), backend, job["threads"])
+    warm_up(read_arrays(Path(job["arrays"][0])), backend, job["threads"], job["adaptive"])
     rows = []
     for path in map(Path, job["arrays"]):
         start = time.perf_counter()
@@ -672,7 +673,7 @@ def print_costs(arguments: argparse.Namespace, backend: dict[str, Any], scenes: 
         spent = {}
         for name, (caustics.NARROW_ALPHA, adaptive) in ways.items():
             if not rows:
-                warm_up(scene, backend, arguments.threads)
+                warm_up(scene, backend, arguments.threads, adaptive)
             settings = RenderSettings(
                 arguments.resolution,
                 arguments.max_spp,

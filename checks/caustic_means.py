@@ -1,7 +1,8 @@
 """Whether light paths leave every mean as it is: ``python checks/caustic_means.py [--spp 65536] [--cycles-python PYTHON]``
 
 The six views of bench/caustics.py are rendered by camera paths alone, which need nothing more, and by both kinds of paths, each
-in parts of 1,024 samples that share no path. Prints per view the means over all pixels of radiance as it is, and clamped at 4,
+in parts of 1,024 samples that share no path; with ``--adaptive`` the second way is that of ``render.adaptive``, guided and
+taken to the last sample. Prints per view the means over all pixels of radiance as it is, and clamped at 4,
 how far the second is from the first, and the standard error of that, told from the parts. With ``--cycles-python`` naming an
 interpreter that has ``bpy``, Cycles renders the same (``--cycles-spp``). Exits with 1 where a difference is over
 ``--tolerance`` and over three standard errors. Some 20 minutes of one core.
@@ -31,6 +32,7 @@ from stages.renderformer.rendering.settings import RenderSettings  # noqa: E402
 
 CLAMP = 4.0
 PART = 1024  # samples per pixel
+NEVER = 1e-9  # an error that no view meets
 
 
 class Means:
@@ -45,11 +47,11 @@ class Means:
         self.clamped = np.minimum(whole, CLAMP).mean(), np.std([(part * free).mean() for part in parts], ddof=1) * error
 
 
-def ours(scene: SceneRecord, side: int, spp: int, light_paths: bool, backend: dict, threads: int) -> list[np.ndarray]:
+def ours(scene: SceneRecord, side: int, spp: int, light_paths: bool, backend: dict, threads: int, **way) -> list[np.ndarray]:
     served = caustics.NARROW_ALPHA
     try:
         caustics.NARROW_ALPHA = served if light_paths else 0.0  # no part of a surface is narrow: nothing is left to light paths
-        every = (RenderSettings(side, PART, seed, denoise=False) for seed in range(spp // PART))
+        every = (RenderSettings(side, PART, seed, denoise=False, **way) for seed in range(spp // PART))
         return [render_views(scene, settings, backend, threads=threads)[0].image for settings in every]
     finally:
         caustics.NARROW_ALPHA = served
@@ -79,19 +81,20 @@ def main() -> int:
     parser.add_argument("--spp", type=int, default=65536, help="samples per pixel, default %(default)s")
     parser.add_argument("--resolution", type=int, default=32, help="default %(default)s")
     parser.add_argument("--views", nargs="+", default=NAMES, choices=NAMES, metavar="NAME", help="default: all six")
+    parser.add_argument("--adaptive", action="store_true", help="guided, as render.adaptive has it")
     parser.add_argument("--threads", type=int, default=1, help="default %(default)s")
     parser.add_argument("--tolerance", type=float, default=0.005, help="relative, default %(default)s")
     parser.add_argument("--cycles-python", metavar="PYTHON", help="an interpreter that has bpy")
     parser.add_argument("--cycles-spp", type=int, default=65536, help="default %(default)s")
     arguments = parser.parse_args()
     backend, failed = choose(), 0
+    way = {"adaptive": True, "target_error": NEVER} if arguments.adaptive else {}
     print("| view | plain: camera paths | light paths too | Cycles | clamped: camera paths | light paths too | Cycles |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
     for view in arguments.views:
         scene, side = caustic_scene(view), arguments.resolution
-        camera, both = (
-            Means(ours(scene, side, arguments.spp, light_paths, backend, arguments.threads)) for light_paths in (False, True)
-        )
+        camera = Means(ours(scene, side, arguments.spp, False, backend, arguments.threads))
+        both = Means(ours(scene, side, arguments.spp, True, backend, arguments.threads, **way))
         cycles = None
         if arguments.cycles_python:
             cycles = Means(by_cycles(scene, side, arguments.cycles_spp, arguments.cycles_python, arguments.threads))

@@ -9,7 +9,7 @@ from pipeline.keys import canonical
 from stages.graphics.mitsuba import backend as backends
 from stages.renderformer.rendering.adaptive import AIM, CELL, CELL_GROWTH, LEAST, MULTIPLE, next_counts
 from stages.renderformer.rendering.error import ThriftyJudge
-from stages.renderformer.s04_render import RenderConfig
+from stages.renderformer.s04_render import Render, RenderConfig
 from tests.renderformer.fakes import path_traced
 from tests.renderformer.test_caustics import hashed, mirrors, renderer, two_views, views  # noqa: F401 (a fixture)
 from tests.renderformer.test_rendering import caustic, jit  # noqa: F401 (a fixture)
@@ -123,3 +123,6 @@ def test_a_view_stops_at_its_target_with_fewer_samples(jit, views):  # noqa: F81
 
 def test_keys_know_of_it_where_it_is_on():
     assert "adaptive" not in canonical(RenderConfig()) and canonical(RenderConfig(adaptive=True))["adaptive"] is True
+    assert not Render().identity(RenderConfig(), None) and Render().identity(RenderConfig(adaptive=True), None) == {
+        "adaptive": 2
+    }

@@ -67,13 +67,36 @@ def test_densities_are_those_of_what_is_drawn(rng):
     column, row = np.minimum(drawn * SIDE, SIDE - 1).astype(int)
     assert (place == (7 * 2 + specular) * BINS + column * SIDE + row).mean() > 0.999  # but for rounding at edges
     assert np.ptp(chance) > 1  # something was learned
-    for lobe, usual in ((True, 0.6), (False, 0.4)):  # the probability of each bin, of the material's own and as it came
-        of_lobe = specular == lobe
-        counted = np.bincount(place[of_lobe] % BINS, minlength=BINS) / len(place)
-        told = np.bincount(place[of_lobe] % BINS, chance[of_lobe], minlength=BINS) / np.maximum(counted * len(place), 1)
-        np.testing.assert_allclose(counted, told * usual / BINS, atol=4 * np.sqrt(counted.max() / len(place)))
-    assert (1 / chance).mean() == pytest.approx(1, abs=0.02)
-    assert (1 / chance).max() < 1.01 / (FLOOR * FLOOR / 2)  # no path is left out
+    fine = 4 * SIDE  # so that spots within a bin count, too
+    for lobe, usual in ((True, 0.6), (False, 0.4)):  # by one over its density, each spot counts as if nothing was learned
+        x, y = (drawn[:, specular == lobe] * fine).astype(int)
+        weight = 1 / chance[specular == lobe]
+        sums, squares = (np.bincount(x * fine + y, weight**power, minlength=fine**2) for power in (1, 2))
+        expected = len(place) * usual / fine**2
+        assert (np.abs(sums - expected) <= 5 * np.sqrt(squares) + 1e-9).all()
+        assert np.abs(sums.mean() - expected) < 0.02 * expected
+    assert (1 / chance).max() < 1.01 / (FLOOR * FLOOR / (2 - FLOOR))  # no path is left out
+
+
+@pytest.mark.parametrize(("specular", "diffuse"), [(0.5, 0.0), (0.0, 0.5)])
+def test_one_lobe_is_taken_always(rng, specular, diffuse):
+    guide = taught(rng)
+    for first in (True, False):
+        taken, _, chance, _, _ = leave(guide, lobes(0.2, specular, diffuse), first, True, cell=9)
+        assert (taken == (specular > 0)).all() and (first or (chance == 1).all())
+
+
+def test_pixels_belong_to_cells():
+    import mitsuba as mi
+
+    height, width, views = 1000, 600, 2
+    guide = PrimaryGuide(views, (height, width))
+    view, row, column = np.meshgrid(*map(np.arange, (views, height, width)), indexing="ij")
+    side = -(-height // CELLS)
+    rows, columns = guide.shape[1:]
+    expected = (view * rows + row // side) * columns + column // side
+    assert (guide.cell(mi.UInt32(np.arange(expected.size))).numpy() == expected.ravel()).all()
+    assert expected.max() + 1 == np.prod(guide.shape)
 
 
 def test_later_surfaces_prefer_narrow_lobes_in_chains_alone(rng):
@@ -107,18 +130,21 @@ def test_less_noise_and_the_same_mean():
 
     scene, size, spp = mirrors(roughness=0.31, lamp=0.1), 32, 64
     images = {}
-    for primary in (False, True):
+    for way in ("plain", "untaught", "taught"):
         runs = []
-        for seed in range(16):
+        for seed in range(40):
+            primary = way != "plain"
             renderer = JitRenderer(scene, (size, size), seed, Limits(8), False, light_paths=True, primary=primary)
-            renderer.sample([0], [0], 0, 64)
-            renderer.learn([0])
-            ((sums,),) = renderer.sample([0], [1], 64, spp)
+            renderer.sample([0], [0, 1], 0, 64)
+            if way == "taught":
+                renderer.learn([0])
+            ((sums,), _) = renderer.sample([0], [0, 1], 64, spp)
             runs.append(sums.lights.astype(np.float64) / spp)
-        images[primary] = np.stack(runs)
-    means = {flag: runs.mean(axis=(2, 3)) for flag, runs in images.items()}  # (runs, lights, channels)
-    spread = np.sqrt(sum(of.var(axis=0, ddof=1) / len(of) for of in means.values()))
-    gap = np.abs(means[True].mean(axis=0) - means[False].mean(axis=0))
-    assert (spread < 0.01 * means[False].mean(axis=0)).all() and (gap <= 4 * spread).all()
-    noise = {flag: runs.var(axis=0, ddof=1).mean() for flag, runs in images.items()}
-    assert noise[True] < 0.75 * noise[False]
+        images[way] = np.stack(runs)
+    means = {way: runs.mean(axis=(2, 3)) for way, runs in images.items()}  # (runs, lights, channels)
+    for way in ("untaught", "taught"):
+        spread = np.sqrt(sum(means[each].var(axis=0, ddof=1) / len(means[each]) for each in ("plain", way)))
+        gap = np.abs(means[way].mean(axis=0) - means["plain"].mean(axis=0))
+        assert (gap <= 4 * spread).all() and (gap < 0.005 * means["plain"].mean(axis=0)).all()
+    noise = {way: runs.var(axis=0, ddof=1).mean() for way, runs in images.items()}
+    assert noise["taught"] < 0.8 * noise["untaught"] and noise["untaught"] < 1.1 * noise["plain"]

@@ -7,8 +7,9 @@ and knows a light that a ray hits by its triangle index. Next-event estimation a
 power heuristic.
 
 One lane of the kernel traces a block of 8 to 64 samples of a pixel, the next one as soon as a path ends, and keeps their sums:
-lanes of a vector stay busy, and nothing is added by atomics. The host adds a pixel's blocks in order. A sample is a function of
-(seed, stream, view, pixel, number) only: the bytes are the same for any thread count and any chunk size.
+lanes of a vector stay busy, and no light is added by atomics. The host adds a pixel's blocks in order. A sample is a function
+of (seed, stream, view, pixel, number), and of what guides learned from earlier portions, which adds up in whole numbers. So
+the bytes are the same for any thread count and any chunk size.
 """
 
 from __future__ import annotations
@@ -158,7 +159,7 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
     bool, camera rays pass through lights. The triangle is that of the first sample, -1 where it hit nothing.
     ``diffuse_start``: the first surface is a white diffuse one, whatever its material. ``photons``: light
     that light paths have left; what belongs to those is left out (``caustics``). ``guide`` learns, and picks directions; so
-    does ``primary``, for first surfaces, where there are photons.
+    does ``primary``, of lobes and at first surfaces, where there are photons.
     """
     max_bounces, max_diffuse, max_glossy, clamp = limits
     slots = [mi.Color3f(0) for _ in range(SLOTS)]

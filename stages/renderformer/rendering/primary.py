@@ -1,10 +1,13 @@
-"""Guided first directions: where a view's pixels get their light from, in the random numbers of the first scattering.
+"""Guided lobes and first directions: where pixels get their light from, in the random numbers of the first scattering.
 
 A glossy wall that mirrors a highlight: most directions of its lobe miss it, and the few that find it are very bright. Which
 random numbers find it hardly changes from a pixel to the next. So cells of a view's pixels keep a histogram of them for either
 lobe, diffuse and specular: how much light they brought, squared. Later paths draw their numbers, and the lobe, by its root,
-which leaves the least noise, and count by one over the density. The lobe stays part of each direction, and whatever was learned
-leaves the mean exact. After Guo et al., "Primary Sample Space Path Guiding" (2018), of the first bounce alone.
+which leaves the least noise, and count by one over the density. So the lobe stays part of each direction, and the mean is exact
+whatever was learned. After Guo et al., "Primary Sample Space Path Guiding" (2018), of the first bounce alone.
+
+Behind it nothing is learned. But what narrow lobes show of a surface are its own reflections, lamps among them, so there narrow
+lobes are preferred (`ODDS`).
 
 What is learned adds up in whole numbers, per view: bytes depend neither on the order of threads nor on which other views are
 rendered.
@@ -26,9 +29,9 @@ CELL, CELLS = 4, 64  # pixels along a cell's side, at least; cells along a view'
 SIDE = 8  # bins of each of a direction's two numbers
 BINS = SIDE * SIDE
 EDGES = SIDE + 1
-FLOOR = 0.3  # share of paths that go as they would have without what was learned, at least
+FLOOR = 0.3  # share of what was not learned: even, in the density of a lobe's bins and in the weights of lobes
 BLUR, BIN_BLUR = 0.5, 0.3  # what counts of a neighbouring cell and of a neighbouring bin
-ODDS = 3.0  # by which a narrow lobe seen in narrow ones is preferred: lamps are as bright there as they are
+ODDS = 3.0  # by which a narrow lobe is preferred that is seen in narrow ones alone: lamps keep their full brightness there
 BRIGHTEST = 16.0  # a path counts as this much at most
 MOST = 2.0**20  # and its square, over its density
 UNIT = 2.0**-16  # of the whole numbers that squares add up in
@@ -110,10 +113,10 @@ class PrimaryGuide:
         usual = lobes.specular_share
         learned = dr.gather(mi.Float, self.specular, cell, first)
         odds = dr.select(first, learned / (1 - learned), dr.select(chain & lobes.is_narrow, ODDS, 1))
-        share = usual * odds / dr.maximum(usual * odds + 1 - usual, 1e-9)
+        share = usual * odds / (usual * odds + (1 - usual))  # exact where there is one lobe
         specular = pick < share
         usual, share = (dr.select(specular, x, 1 - x) for x in (usual, share))
-        chance = share / dr.maximum(usual, 1e-9)
+        chance = dr.select(usual > 0, share / usual, 1)
 
         lobe = cell * 2 + dr.select(specular, 1, 0)
         table = lobe * ((1 + SIDE) * EDGES)

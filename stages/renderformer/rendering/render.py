@@ -186,7 +186,9 @@ def _renderer(scene: SceneRecord, settings: RenderSettings, backend: dict[str, A
 
     if settings.mode == "physical":
         guided = settings.target_error > 0 and settings.max_spp > FIRST_SPP  # else there is no second portion to guide
-        return JitRenderer(scene, size, seed, Limits(depth - 1), lights_visible, guided, light_paths=True, primary=adaptive)
+        return JitRenderer(
+            scene, size, seed, Limits(depth - 1), lights_visible, guided, light_paths=True, primary=adaptive and guided
+        )
     # Cycles lets light in at the hit behind the last counted bounce, hence 12 + 1.
     bounces = min(depth - 1, 13)
     limits = Limits(bounces, 4, 4, 10.0, "blackman-harris", glossy_filter=True, multiscatter=True)

@@ -24,7 +24,8 @@ class RenderSettings:
     max_depth: longest path in segments; 2 is direct light only.
     denoise: Open Image Denoise, every light on its own.
     adaptive: samples behind the first go where they pay (``stages.renderformer.rendering.adaptive``), no longer to all pixels
-        alike. The scalar backend knows no such thing.
+        alike; where there are light paths, first directions are guided (``stages.renderformer.rendering.primary``). The scalar
+        backend knows no such thing.
     lights_visible: whether camera rays see lights; reflections always do.
     """
 
