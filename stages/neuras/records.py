@@ -239,6 +239,11 @@ def scaffold_mesh(scaffold: Artifact) -> Mesh:
     return Mesh(**unpack_arrays(scaffold.read("mesh").members["mesh.npz"]))
 
 
+def surfel_faces(scaffold: Artifact) -> int:
+    """How many of its mesh's faces, the last ones, are of surfels."""
+    return unpack_json(scaffold.read("mesh").members["mesh.json"])["faces"].get("surfels", 0)
+
+
 def load_atlas(path: Path) -> AtlasMesh:
     arrays = unpack_arrays(path.read_bytes())
     return AtlasMesh(**{**arrays, "width": arrays["width"].item(), "height": arrays["height"].item()})

@@ -80,7 +80,8 @@ class Scaffold(MapStage):
 
     def process(self, worker: Any, item: Item) -> Iterator[Record]:
         from stages.neuras.records import CaptureInfo, Mesh, frames
-        from stages.neuras.surfaces import reconstruct, simplify, visibility
+        from stages.neuras.surfaces import simplify, visibility
+        from stages.neuras.surfaces.surfels import nearest
 
         config, capture = worker
         info = CaptureInfo.of(capture)
@@ -111,7 +112,7 @@ class Scaffold(MapStage):
         if len(mesh.faces):
             mesh = simplify.without_specks(mesh, config.speck_faces, largest)
         if config.surfels:
-            surfels = reconstruct.nearest_surfels(surfels, [view.camera.position for view in views], config.surfels)
+            surfels = nearest(surfels, [view.camera.position for view in views], config.surfels)
             faces["surfels"] = len(surfels.faces)
             mesh = Mesh.joined(mesh, surfels)
         if not len(mesh.faces):
@@ -170,14 +171,15 @@ def _surfels(config: ScaffoldConfig, info: CaptureInfo, mesh: Mesh, points: np.n
     """Squares at the points (P, 3) that lie a voxel and more beside the mesh, turned to their ``sensors`` (P, 3)."""
     from stages.graphics.geometry import measure
     from stages.neuras.surfaces import reconstruct, visibility
+    from stages.neuras.surfaces.surfels import at_points
 
     voxel = config.voxel_m * info.metre
     if not config.surfels or not len(points) or not len(mesh.faces):
-        return reconstruct.surfels(*NONE, voxel)
+        return at_points(*NONE, voxel)
     places, viewers = reconstruct.thin(points, voxel, sensors)
     beside = measure.distances(places, mesh.vertices, mesh.faces) > voxel
     beside &= np.linalg.norm(viewers - places, axis=1) > voxel  # the sensor's own place is no surface
-    squares = reconstruct.surfels(places[beside], viewers[beside], SURFEL * voxel)
+    squares = at_points(places[beside], viewers[beside], SURFEL * voxel)
     if config.carve and len(squares.faces):
         counts = visibility.beams_at(squares, points, sensors, config.carve_m * info.metre)
         passed, stopped = (of_face.reshape(-1, 2).sum(axis=1) for of_face in counts)

@@ -21,7 +21,8 @@ from stages.graphics.browser import find_browser
 from stages.neuras.baking import drawing
 from stages.neuras.evaluation import distributions, drive, paths, report, scores, summary
 from stages.neuras.evaluation.renderers import as_bytes, opengl
-from stages.neuras.evaluation.warping import Source, Warping
+from stages.neuras.evaluation.warping import Warping
+from stages.neuras.rasterizing.photos import Source
 from stages.neuras.records import FrameRecord
 from tests.model import inception, lpips
 from tests.neuras import line, scenes

@@ -17,7 +17,8 @@ from stages.neuras.records import CaptureInfo, Mesh
 from stages.neuras.s01_scaffold import ScaffoldConfig
 from stages.neuras.s01_scaffold import _surfels as scaffold_surfels
 from stages.neuras.s03_atlas import Atlas, AtlasConfig
-from stages.neuras.surfaces import planar, reconstruct, simplify, unfold, visibility
+from stages.neuras.surfaces import planar, reconstruct, simplify, surfels, unfold, visibility
+from stages.neuras.surfaces.photometric import Photo
 from tests.neuras import scenes
 
 
@@ -185,7 +186,7 @@ def test_a_surfel_is_a_square_about_its_point_and_faces_its_viewer():
     rng = np.random.default_rng(3)
     points, viewers = rng.normal(size=(20, 3)), rng.normal(size=(20, 3)) * 5
     viewers[:3] = points[:3] + 4 * np.eye(3)  # along the axes too
-    squares = reconstruct.surfels(points, viewers, 0.2)
+    squares = surfels.at_points(points, viewers, 0.2)
     corners = squares.vertices.reshape(20, 4, 3)
     assert np.allclose(corners.mean(axis=1), points, atol=1e-5)
     assert np.allclose(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2), 0.2, atol=1e-5)
@@ -194,7 +195,7 @@ def test_a_surfel_is_a_square_about_its_point_and_faces_its_viewer():
     normals = measure.face_vectors(squares.vertices.astype(float), squares.faces)
     cosines = np.einsum("ij,ij->i", normals, np.repeat(towards, 2, axis=0)) / np.linalg.norm(normals, axis=1)
     assert np.allclose(cosines, 1, atol=1e-4)
-    assert not len(reconstruct.surfels(points[:0], viewers[:0], 0.2).faces)
+    assert not len(surfels.at_points(points[:0], viewers[:0], 0.2).faces)
 
 
 def test_points_that_the_surface_passes_by_become_surfels():
@@ -226,10 +227,36 @@ def test_points_that_the_surface_passes_by_become_surfels():
 
 def test_of_too_many_surfels_the_nearest_stay():
     points = np.column_stack([np.arange(10.0), np.zeros(10), np.zeros(10)])
-    squares = reconstruct.surfels(points, points + [0, 0, 1.0], 0.1)
-    few = reconstruct.nearest_surfels(squares, [np.array([0.0, 0, 0]), np.array([9.0, 0, 0])], 4)
+    squares = surfels.at_points(points, points + [0, 0, 1.0], 0.1)
+    few = surfels.nearest(squares, [np.array([0.0, 0, 0]), np.array([9.0, 0, 0])], 4)
     assert np.allclose(few.vertices.reshape(-1, 4, 3).mean(axis=1)[:, 0], [0, 1, 8, 9], atol=1e-6)
-    assert reconstruct.nearest_surfels(squares, [np.zeros(3)], 10) is squares
+    assert surfels.nearest(squares, [np.zeros(3)], 10) is squares
+
+
+def test_surfels_that_photos_see_through_are_found():
+    """Three squares before a wall: one is there, one is not, and no photo looks at the third."""
+    rng = np.random.default_rng(4)
+    pattern = rng.random((64, 64, 3))
+    wall = np.array([[-8, 8, -8], [8, 8, -8], [8, 8, 8], [-8, 8, 8]], np.float32)
+    behind = Mesh(wall, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+    places = np.array([[-1.0, 3, 0], [1.0, 3, 0], [0.0, -5, 0]])
+    squares = surfels.at_points(places, places - [0, 9.0, 0], 0.5)
+    mesh = Mesh.joined(behind, squares)
+    there = Mesh.joined(behind, Mesh.compact(squares.vertices, squares.faces[:2]))
+    photos = []
+    for x in np.linspace(-1, 1, 6):
+        pose = np.eye(4)
+        pose[:3, :3] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # looks along +y, z up
+        pose[:3, 3] = [x, 0, 0]
+        camera = Camera(80, 80, 60.0, 60.0, 40.0, 40.0, pose)
+        view = Caster(there.vertices, there.faces).view(camera)
+        points = camera.position + camera.directions() * view.depth[..., None]
+        column, row = ((points[..., axis] + 8) * 4 for axis in (0, 2))
+        colours = pattern[row.astype(int).clip(0, 63), column.astype(int).clip(0, 63)]
+        colours[view.face >= 2] = [0.9, 0.1, 0.1]
+        photos.append(Photo(camera, (colours * 255).astype(np.uint8), np.ones((80, 80), bool)))
+    assert surfels.seen_through(mesh, len(squares.faces), photos, 4).tolist() == [False, True, False]
+    assert not surfels.seen_through(mesh, len(squares.faces), photos[:1], 4).any()  # nothing tells
 
 
 def test_pixels_per_unit_grow_as_the_camera_comes_nearer():

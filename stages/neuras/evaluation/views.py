@@ -17,7 +17,8 @@ from stages.graphics.metrics import SSIM_MIN_SIZE
 from stages.neuras.baking.drawing import Drawing
 from stages.neuras.evaluation import scores
 from stages.neuras.evaluation.renderers import Reference, as_bytes
-from stages.neuras.evaluation.warping import Source, Warping
+from stages.neuras.evaluation.warping import Warping
+from stages.neuras.rasterizing.photos import Source
 from stages.neuras.records import AtlasMesh, FrameRecord, Mesh, fitted_poses, posed
 from stages.neuras.surfaces import photometric
 

@@ -7,26 +7,13 @@ their direction alone, as if infinitely far, among source pixels without a point
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.ndimage import distance_transform_edt
 
 from stages.graphics.cameras import Camera
-from stages.graphics.casting import Caster, GBuffer
-
-TOLERANCE = 0.02  # relative difference of depth under which a source sees the same point
-FAR = 1e6  # in scene radii: where a pixel without a point is taken to lie
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A photo, and what its pixels see of the scaffold. image: (H, W, 3) float32 in [0, 1]; counts: (H, W) bool, its mask."""
-
-    camera: Camera
-    image: np.ndarray
-    counts: np.ndarray
-    view: GBuffer
+from stages.graphics.casting import Caster
+from stages.neuras.rasterizing.photos import FAR, Source, look_up
 
 
 class Warping:
@@ -79,22 +66,3 @@ class Warping:
         image = total / np.where(seen, weights, 1)[..., None]
         rows, columns = distance_transform_edt(~seen, return_distances=False, return_indices=True)
         return image[rows, columns].astype(np.float32), seen
-
-
-def look_up(source: Source, points: np.ndarray, on_mesh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (H, W, 3) of world ``points`` (H, W, 3) in a source, and (H, W) bool: whether the source sees them.
-
-    It sees a point on the mesh where its own depth agrees, and one off the mesh where it hits nothing itself.
-    """
-    pixels, ahead = source.camera.project(points)
-    width, height = source.camera.width, source.camera.height
-    x, y = pixels[..., 0] - 0.5, pixels[..., 1] - 0.5
-    inside = (ahead > 0) & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
-    column, row = np.rint(x).astype(int), np.rint(y).astype(int)
-    distance = np.linalg.norm(points - source.camera.position, axis=-1)
-    stored = source.view.depth[row, column]
-    same = np.abs(stored - distance) <= TOLERANCE * distance
-    sees = inside & source.counts[row, column] & np.where(on_mesh, same & (stored > 0), stored == 0)
-    colour = np.stack([map_coordinates(source.image[..., c], [y, x], order=1, mode="nearest") for c in range(3)], axis=-1)
-    return colour, sees

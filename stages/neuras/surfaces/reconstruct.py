@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
@@ -105,29 +104,6 @@ def _signed_distances(places: np.ndarray, tree: cKDTree, point_normals: np.ndarr
     closest = np.where(there[:, :1], apart[:, :1], 1.0)
     weights = np.where(there, np.exp(-np.square(np.where(there, apart, 0.0) / (closest + 0.1 * trim))), 0.0)
     return np.where(there[:, 0], (weights * planes).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-300), np.nan)
-
-
-def surfels(points: np.ndarray, viewers: np.ndarray, side: float) -> Mesh:
-    """A square of two triangles at each point, turned towards where the point was seen from. points, viewers: (P, 3)."""
-    towards = viewers - points
-    towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    least = np.eye(3)[np.abs(towards).argmin(axis=1)]  # the axis that is least along the view
-    across = np.cross(towards, least)
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-    along = np.cross(towards, across)
-    corners = [points + side / 2 * (a * across + b * along) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    faces = 4 * np.arange(len(points))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
-    return Mesh(np.stack(corners, axis=1).reshape(-1, 3).astype(np.float32), faces.reshape(-1, 3).astype(np.int32))
-
-
-def nearest_surfels(squares: Mesh, eyes: Sequence[np.ndarray], most: int) -> Mesh:
-    """The ``most`` squares that are nearest to any of the ``eyes`` (3,), in their order."""
-    if len(squares.faces) <= 2 * most:
-        return squares
-    centres = squares.vertices[squares.faces].mean(axis=1).reshape(-1, 2, 3).mean(axis=1)
-    apart = cKDTree(np.array(eyes)).query(centres)[0]
-    kept = np.sort(np.argsort(apart, kind="stable")[:most])
-    return Mesh.compact(squares.vertices, squares.faces.reshape(-1, 2, 3)[kept].reshape(-1, 3))
 
 
 def terrain(points: np.ndarray, up: np.ndarray, longest: float, outlier: float) -> Mesh:
