@@ -1,8 +1,8 @@
 """Stage refine: the scaffold's vertices and the training cameras, moved until the photos agree.
 
 Reads a capture's training frames and the scaffold; writes one record "mesh", and beside it, where cameras moved, the poses of
-all frames. Real cameras' poses are off by a pixel and more, and one texture shows the mean of what disagrees. Where asked,
-surfels go that photos see through. ``stages.neuras.surfaces.photometric`` and ``surfels`` do it. Held-out photos are not looked
+all frames. Real cameras' poses are off by a pixel and more, and one texture shows the mean of what disagrees. Surfels go
+that photos see through. ``stages.neuras.surfaces.photometric`` and ``surfels`` do it. Held-out photos are not looked
 at: their cameras follow those beside them.
 """
 
@@ -29,7 +29,7 @@ class RefineConfig(StageConfig):
 
     vertices: bool = False  # they move along their normals
     cameras: bool = True  # they turn and shift
-    surfels: bool = added(False, False)  # those go that photos see through
+    surfels: bool = added(True, False)  # those go that photos see through
     blurs: tuple[float, ...] = Field((4.0, 2.0, 1.0), min_length=1)  # sigma of each level, coarse to fine
     rounds: int = Field(3, ge=1)  # steps of each level
     neighbours: int = Field(4, ge=1)  # nearest photos that a photo is compared with

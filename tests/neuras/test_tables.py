@@ -46,10 +46,11 @@ def test_rows_differ_in_what_they_say_alone(jobs):
     for table in ("table1", "table2", "table3", "table4"):
         atlases = {key for row, key in keys(table, "atlas").items() if row != "extended"}
         assert len(atlases) == 1 and len(set(keys(table, "fit").values())) == len(jobs[table])
-    for table, past in (("table1", ["extended"]), ("limits", ["extended", "seen_through"])):
+    for table, past in (("table1", ["extended"]), ("limits", ["extended", "all_surfels"])):
         assert [row for row, job in jobs[table].items() if job.plan["bake"].config.residuals] == past
         assert [row for row, job in jobs[table].items() if job.plan["scaffold"].config.surfels] == past
-    assert [row for row, job in jobs["limits"].items() if job.plan["refine"].config.surfels] == ["seen_through"]
+    for table in ("table1", "limits"):
+        assert [row for row, job in jobs[table].items() if job.plan["refine"].config.surfels] == ["extended"]
     assert differ("limits", "fit") == {
         "texture_levels": [3] * 4 + [1, 3, 3, 3], "near_opacity": [0.12] * 5 + [0.5, 0.12, 0.12],
         "skyboxes": [6] * 6 + [1, 6], "sky_near_m": [150.0] * 6 + [2400.0, 150.0], "direction_noise": [0.0] * 7 + [0.08]

@@ -178,7 +178,7 @@ TABLES = (
             Row("as in the tables above", "ours"),
             Row("surfels where the surface passes points by", "extended", method="textures"),
             Row("and residuals of the nearest photos", "extended"),
-            Row("and without the surfels that photos see through", "seen_through"),
+            Row("the same, with surfels that photos see through", "all_surfels"),
             Row("vertices that move until photos agree", "vertices"),
             Row("one texture level", "one_level"),
             Row("near skyboxes begin half opaque", "near_opacity"),
@@ -186,7 +186,8 @@ TABLES = (
             Row("noise on the view direction", "direction_noise"),
         ),
         {},
-        "Each of the first four rows has what the one above has, and changes one thing more. Every other row differs from the "
-        "first in one thing. Vertices that move do not make photos agree better on this street, so they stay where they are.",
+        "Each of the first three rows has what the one above has, and one thing more; the fourth keeps what the third leaves "
+        "out. Every other row differs from the first in one thing. Vertices that move do not make photos agree better on this "
+        "street, so they stay where they are.",
     ),
 )
