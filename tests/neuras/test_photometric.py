@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from pipeline.stage import Item, Record
-from stages.graphics.arrays import pack_arrays
+from stages.graphics.arrays import pack_arrays, pack_json
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster
 from stages.graphics.page import png
-from stages.neuras.records import FrameRecord, Mesh, refined_poses
+from stages.neuras.records import FrameRecord, Mesh, refined_poses, scaffold_mesh
 from stages.neuras.s02_refine import Refine, RefineConfig
-from stages.neuras.surfaces import photometric
+from stages.neuras.surfaces import photometric, surfels
 from stages.neuras.surfaces.photometric import Photo, Settings
 
 POSITIONS = [(-0.8, -0.6, 4.0), (0.0, -0.8, 4.1), (0.8, -0.6, 4.0), (-0.5, 0.7, 4.0), (0.6, 0.6, 4.2)]
@@ -157,7 +157,7 @@ def test_a_camera_without_a_photo_follows_those_beside_it(truth):
 
 def test_the_stage_moves_cameras_and_those_of_held_out_frames_with_them(truth):
     mesh, photos = truth
-    scaffold = Folder(Record("mesh", {"mesh.npz": pack_arrays(vars(mesh))}))
+    scaffold = Folder(Record("mesh", {"mesh.npz": pack_arrays(vars(mesh)), "mesh.json": pack_json({"faces": {}})}))
 
     def refined(photos: list[Photo]) -> dict[str, np.ndarray]:
         """The training photos, and the first one once more as a test photo that shows nothing."""
@@ -174,6 +174,26 @@ def test_the_stage_moves_cameras_and_those_of_held_out_frames_with_them(truth):
     cameras = [replace(photo.camera, camera_to_world=poses[f"frame-{n}"]) for n, photo in enumerate(wrong)]
     assert off(cameras, photos, points) < 0.3 * off([photo.camera for photo in wrong], photos, points)
     assert np.abs(poses["frame-held_out"] - poses["frame-0"]).max() < 1e-3
+
+
+def test_surfels_that_training_photos_see_through_go(truth):
+    """One patch over the surface that photos do not show. A held-out photo of another colour says nothing."""
+    mesh, photos = truth
+    places = np.array([[0.1, 0.0, 1.2], [-0.2, 0.1, -50.0]])  # over the surface; where none looks
+    squares = surfels.at_points(places, places + [0, 0, 1.0], 0.3)
+    whole = Mesh.joined(mesh, squares)
+    members = {"mesh.npz": pack_arrays(vars(whole)), "mesh.json": pack_json({"faces": {"surfels": 4}})}
+    pictures = [(f"frame-{n}", photo, photo.image, "train") for n, photo in enumerate(photos)]
+    pictures.append(("frame-held_out", photos[0], 0 * photos[0].image, "test"))
+    records = [FrameRecord(id, photo.camera, png(image), split).to_record() for id, photo, image, split in pictures]
+    kept = {}
+    for flag in (True, False):
+        config = RefineConfig(cameras=False, surfels=flag)
+        (record,) = Refine().process((config, Folder(*records), Folder(Record("mesh", members))), Item("mesh"))
+        kept[flag] = scaffold_mesh(Folder(record))
+    assert (kept[False].faces == whole.faces).all()
+    expected = Mesh.compact(whole.vertices, np.delete(whole.faces, [len(mesh.faces), len(mesh.faces) + 1], axis=0))
+    assert (kept[True].faces == expected.faces).all() and np.allclose(kept[True].vertices, expected.vertices)
 
 
 def test_exposure_pulls_at_nothing(truth):

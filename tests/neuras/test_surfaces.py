@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -234,29 +236,40 @@ def test_of_too_many_surfels_the_nearest_stay():
 
 
 def test_surfels_that_photos_see_through_are_found():
-    """Three squares before a wall: one is there, one is not, and no photo looks at the third."""
+    """Before a wall one that is there and one that is not, before the sky one that is not, and one that no photo shows."""
     rng = np.random.default_rng(4)
-    pattern = rng.random((64, 64, 3))
-    wall = np.array([[-8, 8, -8], [8, 8, -8], [8, 8, 8], [-8, 8, 8]], np.float32)
-    behind = Mesh(wall, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
-    places = np.array([[-1.0, 3, 0], [1.0, 3, 0], [0.0, -5, 0]])
+    pattern, sky = rng.random((64, 64, 3)), rng.random((64, 64, 3))
+    wall = Mesh(
+        np.array([[-8, 8, -8], [8, 8, -8], [8, 8, 2], [-8, 8, 2]], np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    )
+    places = np.array([[-1.0, 3, 0], [1.0, 3, 0], [0.0, 3, 1.5], [0.0, -5, 0]])
     squares = surfels.at_points(places, places - [0, 9.0, 0], 0.5)
-    mesh = Mesh.joined(behind, squares)
-    there = Mesh.joined(behind, Mesh.compact(squares.vertices, squares.faces[:2]))
-    photos = []
+    mesh, there = Mesh.joined(wall, squares), Mesh.joined(wall, Mesh.compact(squares.vertices, squares.faces[:2]))
+    photos, on_second = [], []
     for x in np.linspace(-1, 1, 6):
         pose = np.eye(4)
         pose[:3, :3] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # looks along +y, z up
         pose[:3, 3] = [x, 0, 0]
         camera = Camera(80, 80, 60.0, 60.0, 40.0, 40.0, pose)
-        view = Caster(there.vertices, there.faces).view(camera)
-        points = camera.position + camera.directions() * view.depth[..., None]
-        column, row = ((points[..., axis] + 8) * 4 for axis in (0, 2))
-        colours = pattern[row.astype(int).clip(0, 63), column.astype(int).clip(0, 63)]
+        view, directions = Caster(there.vertices, there.faces).view(camera), camera.directions()
+        points = camera.position + directions * view.depth[..., None]
+
+        def look(texture: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+            return texture[(v * 64).astype(int).clip(0, 63), (u * 64).astype(int).clip(0, 63)]
+
+        on_wall = look(pattern, (points[..., 0] + 8) / 16, (points[..., 2] + 8) / 16)
+        colours = np.where(view.hit[..., None], on_wall, look(sky, directions[..., 0] + 0.5, directions[..., 2]))
         colours[view.face >= 2] = [0.9, 0.1, 0.1]
         photos.append(Photo(camera, (colours * 255).astype(np.uint8), np.ones((80, 80), bool)))
-    assert surfels.seen_through(mesh, len(squares.faces), photos, 4).tolist() == [False, True, False]
-    assert not surfels.seen_through(mesh, len(squares.faces), photos[:1], 4).any()  # nothing tells
+        on_second.append(np.isin(Caster(mesh.vertices, mesh.faces).view(camera).face, (4, 5)))
+
+    def found(photos: list[Photo]) -> list[bool]:
+        return surfels.seen_through(mesh, len(squares.faces), photos, 4).tolist()
+
+    assert found(photos) == [False, True, True, False]
+    masked = [replace(photo, counts=~hidden) for photo, hidden in zip(photos, on_second, strict=True)]
+    assert found(masked) == [False, False, True, False]
+    assert not any(found(photos[:1]))  # nothing tells
 
 
 def test_pixels_per_unit_grow_as_the_camera_comes_nearer():

@@ -1,1 +1,1 @@
-"""What a camera sees of a mesh: one hit per pixel, by casting rays (embree) or by drawing triangles (OpenGL)."""
+"""What a camera sees of a mesh: how much of the texture a pixel covers, and which photos see a point."""

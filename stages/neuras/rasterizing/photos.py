@@ -25,7 +25,7 @@ class Source:
 
 
 def look_up(source: Source, points: np.ndarray, on_mesh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (H, W, 3) of world ``points`` (H, W, 3) in a source, and (H, W) bool: whether the source sees them.
+    """Colours (.., 3) of world ``points`` (.., 3) in a source, and (..) bool: whether the source sees them.
 
     It sees a point on the mesh where its own depth agrees, and one off the mesh where it hits nothing itself.
     """

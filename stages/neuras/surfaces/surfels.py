@@ -64,22 +64,22 @@ def seen_through(mesh: Mesh, count: int, photos: Sequence[photometric.Photo], ne
         on_square = (own.view.face >= first) & own.counts
         if not on_square.any():
             continue
-        behind, directions = surface.view(camera), camera.directions()
-        near = camera.position + directions * own.view.depth[..., None]
-        beyond = camera.position + directions * np.where(behind.hit, behind.depth, far)[..., None]
+        rays = camera.directions()[on_square]
+        _, _, depth = surface.cast(np.broadcast_to(camera.position, rays.shape), rays)
+        near = camera.position + rays * own.view.depth[on_square][:, None]
+        beyond = camera.position + rays * np.where(depth > 0, depth, far)[:, None]
         others = [other for other in photometric.nearest(cameras, camera.position, neighbours + 1) if other != number]
-        told = [
-            _told([source(other) for other in others[:neighbours]], *way) for way in ((near, on_square), (beyond, behind.hit))
-        ]
-        judged = on_square & told[0][1] & told[1][1]
-        errors = [((colour - own.image) ** 2).mean(axis=-1)[judged] for colour, _ in told]
-        np.add.at(votes, (own.view.face[judged] - first) // 2, errors[0] - errors[1])
+        sources = [source(other) for other in others[:neighbours]]
+        told = [_told(sources, points, on_mesh) for points, on_mesh in ((near, np.ones(len(rays), bool)), (beyond, depth > 0))]
+        judged = told[0][1] & told[1][1]
+        errors = [((colour - own.image[on_square]) ** 2).mean(axis=-1)[judged] for colour, _ in told]
+        np.add.at(votes, (own.view.face[on_square][judged] - first) // 2, errors[0] - errors[1])
     return votes > 0
 
 
 def _told(sources: Sequence[Source], points: np.ndarray, on_mesh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean colours (H, W, 3) of points (H, W, 3) in the sources that see them, and (H, W) bool: whether any does."""
-    colours, seen = np.zeros(points.shape), np.zeros(points.shape[:2])
+    """Mean colours (N, 3) of points (N, 3) in the sources that see them, and (N,) bool: whether any does."""
+    colours, seen = np.zeros(points.shape), np.zeros(len(points))
     for source in sources:
         colour, sees = look_up(source, points, on_mesh)
         colours += colour * sees[..., None]
