@@ -51,6 +51,7 @@ class FirstStep:
         return cls(mi.UInt32(NOWHERE), mi.Float(0), mi.Float(0))
 
     def bring(self, light: mi.Color3f, active: mi.Bool) -> FirstStep:
+        # not dr.mean, which multiplies and divides by the launch's size too: bytes would depend on chunks
         return FirstStep(self.bin, self.factor, self.brought + dr.select(active, dr.sum(light) * (1 / 3), 0))
 
 
