@@ -89,13 +89,15 @@ def test_one_lobe_is_taken_always(rng, specular, diffuse):
 def test_pixels_belong_to_cells():
     import mitsuba as mi
 
+    from stages.renderformer.rendering.jit import Cameras
+
     height, width, views = 1000, 600, 2
-    guide = PrimaryGuide(views, (height, width))
+    guide, cameras = PrimaryGuide(views, (height, width)), Cameras(mirrors(), (height, width), "box")
     view, row, column = np.meshgrid(*map(np.arange, (views, height, width)), indexing="ij")
     side = -(-height // CELLS)
     rows, columns = guide.shape[1:]
     expected = (view * rows + row // side) * columns + column // side
-    assert (guide.cell(mi.UInt32(np.arange(expected.size))).numpy() == expected.ravel()).all()
+    assert (guide.cell(*cameras.place(mi.UInt32(np.arange(expected.size)))).numpy() == expected.ravel()).all()
     assert expected.max() + 1 == np.prod(guide.shape)
 
 

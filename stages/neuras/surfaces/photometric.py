@@ -70,10 +70,7 @@ def refine(
     """The mesh with moved vertices, and the photos' cameras, moved. Both as they were where that hardly helps."""
     cameras = [photo.camera for photo in photos]
     state = _State(mesh, cameras, settings)
-    pairs = {}
-    for number, camera in enumerate(cameras):
-        near = nearest(cameras, camera.position, settings.neighbours + 1)
-        pairs[number] = [other for other in near if other != number][: settings.neighbours]
+    pairs = {number: beside(cameras, number, settings.neighbours) for number in range(len(cameras))}
     for line in _descend(state, photos, pairs, list(range(len(photos)))):
         log(line)
     finest = [normalised(photo, settings.blurs[-1]) for photo in photos]
@@ -365,6 +362,11 @@ def _differences(mesh: Mesh) -> sparse.csr_matrix:
     starts = np.arange(0, edges.size + 1, 2)
     along = sparse.csr_matrix((np.tile([1.0, -1.0], len(edges)), edges.ravel(), starts), (len(edges), len(mesh.vertices)))
     return (along.T @ along).tocsr()
+
+
+def beside(cameras: Sequence[Camera], number: int, count: int) -> list[int]:
+    """The ``count`` other cameras nearest to one of them, nearest first."""
+    return [other for other in nearest(cameras, cameras[number].position, count + 1) if other != number][:count]
 
 
 def nearest(cameras: Sequence[Camera], position: np.ndarray, count: int) -> list[int]:

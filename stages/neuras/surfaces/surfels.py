@@ -1,6 +1,6 @@
 """Surfels: squares at points that no surface holds, of leaves, wires and railings.
 
-A square is two triangles, one behind the other in a mesh. Squares come last in it, so a number tells which faces are squares.
+A square is two faces that follow one another in a mesh. Squares come last, so a number tells which faces they are.
 """
 
 from __future__ import annotations
@@ -68,8 +68,7 @@ def seen_through(mesh: Mesh, count: int, photos: Sequence[photometric.Photo], ne
         _, _, depth = surface.cast(np.broadcast_to(camera.position, rays.shape), rays)
         near = camera.position + rays * own.view.depth[on_square][:, None]
         beyond = camera.position + rays * np.where(depth > 0, depth, far)[:, None]
-        others = [other for other in photometric.nearest(cameras, camera.position, neighbours + 1) if other != number]
-        sources = [source(other) for other in others[:neighbours]]
+        sources = [source(other) for other in photometric.beside(cameras, number, neighbours)]
         told = [_told(sources, points, on_mesh) for points, on_mesh in ((near, np.ones(len(rays), bool)), (beyond, depth > 0))]
         judged = told[0][1] & told[1][1]
         errors = [((colour - own.image[on_square]) ** 2).mean(axis=-1)[judged] for colour, _ in told]

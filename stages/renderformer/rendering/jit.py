@@ -87,10 +87,7 @@ class Cameras:
 
     def ray(self, pixel: mi.UInt32, u: mi.Point2f) -> mi.Ray3f:
         """``pixel`` counts row by row through all views; ``u`` in [0, 1)^2."""
-        view = pixel // (self.height * self.width)
-        inside = pixel - view * self.height * self.width
-        row = inside // self.width
-        column = inside - row * self.width
+        view, row, column = self.place(pixel)
         x = ((mi.Float(column) + 0.5 + self._offset(u.x)) / mi.Float(self.width) - 0.5) * self.aspect
         y = (mi.Float(row) + 0.5 + self._offset(u.y)) / mi.Float(self.height) - 0.5
         local = dr.normalize(mi.Vector3f(x, -y, -dr.gather(mi.Float, self.focal, view)))
@@ -99,6 +96,13 @@ class Cameras:
             *[entry[4 * axis] * local.x + entry[4 * axis + 1] * local.y + entry[4 * axis + 2] * local.z for axis in range(3)]
         )
         return mi.Ray3f(mi.Point3f(entry[3], entry[7], entry[11]), dr.normalize(direction))
+
+    def place(self, pixel: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """View, row and column of a pixel; they count row by row through all views."""
+        view = pixel // (self.height * self.width)
+        inside = pixel - view * self.height * self.width
+        row = inside // self.width
+        return view, row, inside - row * self.width
 
     def project(self, view: mi.UInt32, point: mi.Point3f) -> tuple[mi.Point3f, mi.UInt32, mi.Float]:
         """The camera's position, the pixel (row by row) of the view in which it sees ``point``, and how many pixels an area
@@ -177,7 +181,7 @@ def trace_paths(scene, lights, material, lanes, pass_key, limits, hide, glossy_f
     pure, theirs = mi.Color3f(1), mi.Color3f(0)
     trail = Trail.none()
     step = FirstStep.none()
-    cell = None if primary is None else primary.cell(lanes.pixel)
+    cell = None if primary is None else primary.cell(*lanes.start.place(lanes.pixel))
 
     while done < lanes.count:
         number = lanes.first + done

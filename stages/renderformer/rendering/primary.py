@@ -67,7 +67,6 @@ class PrimaryGuide:
         self._edges = np.empty((count, 2, 1 + SIDE, EDGES), np.float32)
         self._edges[:] = np.linspace(0, 1, EDGES)
         self._specular = np.full(count, 0.5, np.float32)  # weight of the specular lobe over that of both
-        self.height, self.width = (dr.opaque(mi.UInt32, side) for side in size)
         self.rows, self.columns = (dr.opaque(mi.UInt32, side) for side in self.shape[1:])
         self.cell_side = dr.opaque(mi.UInt32, cell)
         self._publish()
@@ -95,12 +94,8 @@ class PrimaryGuide:
             specular[:] = np.divide(of_lobe[:, 1], total, out=np.full(len(total), 0.5), where=total > 0)
         self._publish()
 
-    def cell(self, pixel: mi.UInt32) -> mi.UInt32:
-        """``pixel`` counts row by row through all views."""
-        view = pixel // (self.height * self.width)
-        inside = pixel - view * self.height * self.width
-        row = inside // self.width
-        column = inside - row * self.width
+    def cell(self, view: mi.UInt32, row: mi.UInt32, column: mi.UInt32) -> mi.UInt32:
+        """That of a pixel."""
         return (view * self.rows + row // self.cell_side) * self.columns + column // self.cell_side
 
     def leave(

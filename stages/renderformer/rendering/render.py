@@ -46,8 +46,8 @@ def render_views(
     backend: from ``stages.graphics.mitsuba.backend.choose``. threads: of this process; None: all cores.
     """
     backends.activate(backend, threads)
+    renderer = _renderer(scene, settings, backend)
     adaptive = settings.adaptive and backend["backend"] != "scalar"
-    renderer = _renderer(scene, settings, backend, adaptive)
     # With a target, two streams that share no path: what tells noise from image.
     streams = [0, 1] if settings.target_error > 0 and settings.max_spp > 1 else [0]
     total = settings.max_spp // len(streams)  # of each stream
@@ -173,7 +173,7 @@ def _next(samples: int) -> int:
     return samples * 3 // 2 if power_of_two else samples * 4 // 3
 
 
-def _renderer(scene: SceneRecord, settings: RenderSettings, backend: dict[str, Any], adaptive: bool = False) -> Any:
+def _renderer(scene: SceneRecord, settings: RenderSettings, backend: dict[str, Any]) -> Any:
     """A ``ScalarRenderer`` or ``JitRenderer``; guided where it can be and nothing is clamped."""
     size, seed, depth, lights_visible = settings.size, settings.seed, settings.max_depth, settings.lights_visible
     if backend["backend"] == "scalar":
@@ -186,9 +186,8 @@ def _renderer(scene: SceneRecord, settings: RenderSettings, backend: dict[str, A
 
     if settings.mode == "physical":
         guided = settings.target_error > 0 and settings.max_spp > FIRST_SPP  # else there is no second portion to guide
-        return JitRenderer(
-            scene, size, seed, Limits(depth - 1), lights_visible, guided, light_paths=True, primary=adaptive and guided
-        )
+        primary = guided and settings.adaptive
+        return JitRenderer(scene, size, seed, Limits(depth - 1), lights_visible, guided, light_paths=True, primary=primary)
     # Cycles lets light in at the hit behind the last counted bounce, hence 12 + 1.
     bounces = min(depth - 1, 13)
     limits = Limits(bounces, 4, 4, 10.0, "blackman-harris", glossy_filter=True, multiscatter=True)
