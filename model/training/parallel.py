@@ -6,6 +6,7 @@ is always whole, so a run may go on with another number of processes.
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -15,6 +16,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,7 @@ class Group:
     device: torch.device
     rank: int = 0
     world: int = 1
+    mesh: DeviceMesh | None = None  # all of them in one row, which FSDP splits over; None: this process alone
 
     @property
     def leads(self) -> bool:
@@ -63,10 +66,14 @@ def join(device: str) -> Iterator[Group]:
         own_device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
         torch.cuda.set_device(own_device)
     dist.init_process_group("cpu:gloo,cuda:nccl" if own_device.type == "cuda" else "gloo")
+    mesh = init_device_mesh(own_device.type, (world,))
     try:
-        yield Group(own_device, dist.get_rank(), world)
+        yield Group(own_device, dist.get_rank(), world, mesh)
     finally:
         dist.destroy_process_group()
+        # Gloo's threads can abort an interpreter that ends (SIGABRT after a finished run), so they end first. What keeps them:
+        mesh._pg_registry.clear()  # DTensor's caches hold the mesh, and the mesh its groups
+        gc.collect()  # a model split by FSDP holds itself
 
 
 def distribute(model: nn.Module, group: Group, sharded: bool) -> nn.Module:
@@ -77,8 +84,9 @@ def distribute(model: nn.Module, group: Group, sharded: bool) -> nn.Module:
         from torch.distributed.fsdp import fully_shard
 
         for layer in model.layers():
-            fully_shard(layer)
-        return fully_shard(model, reshard_after_forward=True)  # else validation, without a backward, would leave it whole
+            fully_shard(layer, mesh=group.mesh)
+        # reshard: else validation, without a backward, would leave it whole
+        return fully_shard(model, mesh=group.mesh, reshard_after_forward=True)
     from torch.nn.parallel import DistributedDataParallel
 
     devices = [group.device] if group.device.type == "cuda" else None

@@ -55,6 +55,11 @@ def train(network: str, folder: Path, parallel: str, dies: bool, group: Group) -
     fit(build(NETWORKS[network]), config, batches, validation, folder, group, lambda text: None)
 
 
+def threads() -> list[str]:
+    """Names of this process's threads; none where the system does not tell."""
+    return [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
+
+
 def main() -> None:
     folder, parallel, *dies = sys.argv[1:]
     torch.set_num_threads(1)
@@ -64,6 +69,8 @@ def main() -> None:
                 train(network, Path(folder) / network, parallel, bool(dies), group)
             except Killed:
                 group.wait()
+    if any(name.startswith("pt_gloo") for name in threads()):
+        sys.exit("gloo's threads outlive the group")
     sys.exit("killed" if dies else 0)
 
 

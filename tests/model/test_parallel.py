@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -18,11 +19,17 @@ from tests.model.ranks import STEPS
 
 RANKS = Path(__file__).with_name("ranks.py")
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+RESTARTING = [*TORCHRUN, "--max-restarts=1"]  # as docs/training.md advises: torch's own threads aborted a process once in CI
 
 
 def run(*words: object, start: list[str]) -> subprocess.CompletedProcess:
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"}
     return subprocess.run([*start, str(RANKS), *map(str, words)], capture_output=True, text=True, env=environment)
+
+
+def told(process: subprocess.CompletedProcess) -> str:
+    """What the processes of a run said themselves: torchrun's own table would fill the end of a report."""
+    return process.stderr.split("ChildFailedError")[0][-4000:]
 
 
 def rows(folder: Path) -> list[dict]:
@@ -37,8 +44,10 @@ def runs(tmp_path_factory) -> tuple[Path, Path]:
     assert run(alone, "ddp", start=[sys.executable]).returncode == 0
     assert run(shared, "ddp", "die", start=TORCHRUN).returncode != 0
     assert [rows(shared / network)[-1]["step"] for network in STEPS] == [dies_at for dies_at, _ in STEPS.values()]
-    resumed = run(shared, "fsdp", start=TORCHRUN)
-    assert resumed.returncode == 0, resumed.stderr
+    resumed = run(shared, "fsdp", start=RESTARTING)
+    assert resumed.returncode == 0, told(resumed)
+    if "exitcode" in resumed.stderr:
+        warnings.warn(f"a process died and the run was restarted:\n{told(resumed)}", stacklevel=1)
     return alone, shared
 
 
