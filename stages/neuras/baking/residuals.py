@@ -43,6 +43,7 @@ CACHED = 16  # photos kept in memory
 ANGLES = (5.0, 10.0, 20.0, 40.0)  # degrees that are tried
 HARMLESS = 0.1  # dB that the angle that is taken may cost held-out frames
 JUDGED = 4  # held-out frames that are looked at, at most
+GLANCE = 64  # pixels of a frame's longer side that tell whether it sees the mesh
 
 
 class Renderer(Protocol):
@@ -148,7 +149,7 @@ class Residuals:
 
         centre: (3,) of the skyboxes, world. exposure: whether pictures take the photos' exposure before they are compared.
         """
-        frames = [frame for frame in frames if frame.counts().any() and scene.caster.view(frame.camera).hit.any()]
+        frames = [frame for frame in frames if frame.counts().any() and _sees(scene.caster, frame.camera)]
         if not frames:
             return None
         every = -(-len(frames) // JUDGED)
@@ -170,8 +171,8 @@ class Residuals:
         ways, depth = camera.directions().reshape(-1, 3), view.depth.ravel().astype(float)
         errors = []
         for angle in ANGLES:
-            self.angle = float(np.radians(angle))
-            colours = np.clip(plain + self.at(eye, ways, depth).reshape(plain.shape), 0, 1)
+            added = self.at(eye, ways, depth, float(np.radians(angle)))
+            colours = np.clip(plain + added.reshape(plain.shape), 0, 1)
             picture = np.rint(255 * colours).astype(np.uint8)
             if exposure:
                 picture = matched(picture, photo, counts)
@@ -209,10 +210,11 @@ class Residuals:
         weights = closeness[: self.nearest] - (closeness[self.nearest] if len(order) > self.nearest else 0)
         return order[: self.nearest].tolist(), weights / max(float(weights.sum()), 1e-30)
 
-    def at(self, eye: np.ndarray, ways: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    def at(self, eye: np.ndarray, ways: np.ndarray, depth: np.ndarray, angle: float | None = None) -> np.ndarray:
         """(N, 3) float64, to be added to the colours of rays from ``eye`` (3,) along unit ``ways`` (N, 3).
 
         depth: (N,), the distance to the mesh, 0 where it is missed; such rays are taken to see something infinitely far.
+        angle: radians, in place of the site's own.
 
             sum_k w_k f_k r_k / max(sum_k w_k, LEAST)    with    w_k = weight * border * agreement
 
@@ -220,6 +222,7 @@ class Residuals:
         photo's nearest pixel sees with the point's. r_k: the residual, bilinear. f_k = exp((cos a - 1) / (1 - cos angle)), with
         the angle a between the two rays that see the point; beside the mesh, a point at the distance ``off_mesh``.
         """
+        angle = self.angle if angle is None else angle
         hit = depth > 0
         far = np.where(hit, 1.0, 0.0)
         points = np.where(hit[:, None], eye + ways * depth[:, None], ways)
@@ -241,7 +244,7 @@ class Residuals:
             same = np.clip(1.5 - np.abs(self.distance(code) - distance) / (TOLERANCE * distance), 0, 1)
             agrees = np.where(hit, same * ((code != OPEN) & (code != MASKED)), code == OPEN)
             cosine = np.einsum("ij,ij->i", away, ways) / distance
-            fade = np.exp((cosine - 1) / (1 - np.cos(self.angle)))
+            fade = np.exp((cosine - 1) / (1 - np.cos(angle)))
             share = weight * border * agrees
             total += (share * fade)[:, None] * (_bilinear(source.values, x - 0.5, y - 0.5) - NEUTRAL) / 255
             weights += share
@@ -250,6 +253,12 @@ class Residuals:
     def distance(self, codes: np.ndarray) -> np.ndarray:
         """What codes of depth stand for."""
         return self.near * (self.far / self.near) ** ((codes.astype(float) - 1) / (MASKED - 2))
+
+
+def _sees(caster: Caster, camera: Camera) -> bool:
+    """Whether rays meet the mesh: a few of them, as held-out frames may be many and large."""
+    shrink = max(1, -(-max(camera.width, camera.height) // GLANCE))
+    return bool(caster.view(camera.resized(-(-camera.width // shrink), -(-camera.height // shrink))).hit.any())
 
 
 def _bilinear(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
