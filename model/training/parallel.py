@@ -11,12 +11,14 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
+
+if TYPE_CHECKING:
+    from torch.distributed.device_mesh import DeviceMesh
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,8 @@ def join(device: str) -> Iterator[Group]:
     if world == 1:
         yield Group(torch.device(device))
         return
+    from torch.distributed.device_mesh import init_device_mesh
+
     own_device = torch.device(device)
     if own_device.type == "cuda":
         own_device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
@@ -72,7 +76,7 @@ def join(device: str) -> Iterator[Group]:
     finally:
         dist.destroy_process_group()
         # Gloo's threads can abort an interpreter that ends (SIGABRT after a finished run), so they end first. What keeps them:
-        mesh._pg_registry.clear()  # DTensor's caches hold the mesh, and the mesh its groups
+        getattr(mesh, "_pg_registry", {}).clear()  # DTensor's caches hold the mesh, and torch 2.13's mesh its groups
         gc.collect()  # a model split by FSDP holds itself
 
 
