@@ -52,7 +52,6 @@ from stages.graphics.casting import Caster
 from stages.neuras import s04_fit
 from stages.neuras.baking import site
 from stages.neuras.baking.browser import pictures
-from stages.neuras.baking.drawing import depth_range
 from stages.neuras.commands import size
 from stages.neuras.evaluation import costs
 from stages.neuras.evaluation.drive import scene_of
@@ -233,8 +232,7 @@ class Bench:
         ]
 
     def write(self, folder: Path, scene: Scene, shown: Sequence[Any]) -> dict[str, int]:
-        planes = depth_range(scene.atlas.vertices, scene.info.metre)
-        return site.write_site(folder, scene.baked, scene.atlas, scene.info, shown, planes, "fp16")
+        return site.write_site(folder, scene.baked, scene.atlas, scene.info, shown, scene.planes, "fp16")
 
     def draw(self) -> tuple[Row, list[Row]]:
         cameras = [view.camera for view in self.views if view.split == "test"][:3]
@@ -322,7 +320,7 @@ class Bench:
             pose = camera.camera_to_world.copy()
             pose[:3, 3] -= centre
             fov = float(np.degrees(2 * np.arctan(camera.height / (2 * camera.fy))))
-            planes = depth_range(atlas.vertices, self.scene.info.metre)
+            planes = self.scene.planes
             about = {"size": [camera.width, camera.height], "fov": fov, "planes": planes, "pose": pose.T.ravel().tolist()}
             (folder / "index.html").write_text(THREE.replace("ABOUT", json.dumps(about)))
             with _served(folder) as address, browser.opened(address) as page:

@@ -46,7 +46,8 @@ def placed(scene: Scene, frames: Sequence[FrameRecord], times: int) -> tuple[Sce
         height=atlas.height,
     )
     longer = replace(baked, sky_half_sizes=baked.sky_half_sizes + times * np.abs(way))
-    return Scene(longer, road, scene.info), [_moved(frame, n, n * way) for n in copies for frame in frames[:-1]]
+    planes = depth_range(road.vertices, scene.info.metre, [])
+    return Scene(longer, road, scene.info, planes), [_moved(frame, n, n * way) for n in copies for frame in frames[:-1]]
 
 
 def _moved(frame: FrameRecord, copy: int, by: np.ndarray) -> FrameRecord:
@@ -61,8 +62,7 @@ def write(folder: Path, scene: Scene, frames: Sequence[FrameRecord], side: float
     if side is not None:
         cameras = [frame.camera for frame in frames]
         tiles = cut(scene.atlas, scene.baked.pyramid, scene.info.up, cameras, Tiling(side, reach, LARGEST))
-    planes = depth_range(scene.atlas.vertices, scene.info.metre)
-    site.write_site(folder, scene.baked, scene.atlas, scene.info, frames, planes, "fp16", tiles)
+    site.write_site(folder, scene.baked, scene.atlas, scene.info, frames, scene.planes, "fp16", tiles)
 
 
 def drive(folder: Path, count: int) -> list[dict[str, Any]]:

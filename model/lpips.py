@@ -116,9 +116,17 @@ class LPIPS(nn.Module):
         """The features, each pixel's of length 1. The tiny number under the root keeps its gradient finite where all are 0."""
         return [x / (x.square().sum(dim=1, keepdim=True).add(1e-20).sqrt() + 1e-10) for x in self.features(image)]
 
-    def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """(B, 3, H, W) in [0, 1] each -> (B,) distances."""
+    def forward(self, a: Tensor, b: Tensor, counts: Tensor | None = None) -> Tensor:
+        """(B, 3, H, W) in [0, 1] each -> (B,) distances.
+
+        counts: (H, W) bool. A place of a layer weighs as much as the share of its pixels that count; None: all do.
+        """
         total = a.new_zeros(a.shape[0])
         for x, y, weight in zip(self._directions(a), self._directions(b), self.linear, strict=True):
-            total = total + ((x - y).square() * weight).sum(dim=1).mean(dim=(1, 2))
+            apart = ((x - y).square() * weight).sum(dim=1)
+            if counts is None:
+                total = total + apart.mean(dim=(1, 2))
+            else:
+                share = F.adaptive_avg_pool2d(counts[None, None].to(apart), apart.shape[1:])[:, 0]
+                total = total + (apart * share).sum(dim=(1, 2)) / share.sum()
         return total

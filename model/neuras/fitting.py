@@ -32,6 +32,7 @@ from model.training.logs import TrainingLog
 from pipeline.atomic import atomic_path
 
 STATE = "state.safetensors"
+FEW = 0.2  # share of the photos' pixels on the mesh below which something is wrong with it, most likely
 LOSSES = ("loss", "photometric", "perceptual", "vq")
 
 
@@ -171,9 +172,13 @@ def fit(
     scene = Scene(config, surroundings, pixels)
     trainer = Trainer(scene)
     touched = {name: maps.count for name, maps in scene.maps.items()}
+    met = sum(int((view.hit & view.counts).sum()) for view in views) / max(sum(int(view.counts.sum()) for view in views), 1)
     outputs.say(
-        f"{len(views)} views, {len(pixels.uv):,} pixels touch {touched['mesh']:,} texels, and {touched['sky']:,} of the sky"
+        f"{len(views)} views, {len(pixels.uv):,} pixels, {met:.0%} of them on the mesh, touch {touched['mesh']:,} texels, and "
+        f"{touched['sky']:,} of the sky"
     )
+    if met < FEW:
+        outputs.say("so little of the photos shows the mesh that the rest stays a distant backdrop: look at the scaffold")
     if trainer.load(outputs.state):
         outputs.say(f"going on from step {trainer.step:,} of {config.steps:,}")
     log = TrainingLog(outputs.state, outputs.tensorboard, trainer.step, config.steps, outputs.say)
@@ -203,11 +208,19 @@ def fit(
 def validate(
     scene: Scene, pixels: Pixels, views: Sequence[View], step: int, outputs: Outputs, log: TrainingLog | None = None
 ) -> dict[str, float]:
-    """Mean PSNR over the validation views, of the pixels that count; shown, and logged where there is a ``log``."""
+    """Mean PSNR over the validation views, of the pixels that count; shown, and logged where there is a ``log``. Nothing where
+    masks leave none.
+    """
     rendered = scene.render(pixels)
-    errors = [np.square(image - view.rgb / 255.0)[view.counts].mean() for image, view in zip(rendered, views, strict=True)]
+    errors = [
+        np.square(image - view.rgb / 255.0)[view.counts].mean()
+        for image, view in zip(rendered, views, strict=True)
+        if view.counts.any()
+    ]
+    if not errors:
+        return {}
     psnr = float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
-    outputs.say(f"step {step}/{scene.config.steps}  validation: psnr {psnr:5.2f} dB over {len(views)} views")
+    outputs.say(f"step {step}/{scene.config.steps}  validation: psnr {psnr:5.2f} dB over {len(errors)} views")
     picture = None if outputs.show is None else outputs.show(step, [view.rgb for view in views], rendered)
     if log is not None:
         log.row({"step": step, "validation_psnr": round(psnr, 4)})

@@ -134,8 +134,12 @@ class Scene:
                 for sizes in (shared, filling)
             ),
         }
-        maps = {}
+        maps, everything = {}, sum(total.sum(dim=0) for total in sums.values())
         for name, total in sums.items():
+            if not total[:, 3].any():  # no ray meets it, but other views may: one texel, opaque, has the photos' mean for all
+                one = (self.layers - 1) * 6 * side * side if name == "sky" else 0
+                total[one] = everything / everything[3].clamp(min=1e-6)
+                total[one, 3] = 1
             touched = total[:, 3] > 0
             start = torch.zeros(int(touched.sum()), channels, device=self.device)
             start[:, :3] = total[touched, :3] / total[touched, 3:]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 SPARED = 25  # faces of a piece of a given mesh from which on it is decimated
+SPACINGS = 3  # of points without a sensor: a surface reaches at least so far from them
 NONE = (np.zeros((0, 3)), np.zeros((0, 3)))  # points and where they were seen from
 SURFEL = 1.25  # side of a surfel, in voxels: neighbours overlap a little
 THROUGH = 10  # beams through a surfel for one that ends there: leaves let some pass, where a passer-by stood all but one do
@@ -57,7 +58,7 @@ class ScaffoldConfig(StageConfig):
 
 class Scaffold(MapStage):
     name: ClassVar[str] = "scaffold"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     inputs: ClassVar[tuple[str, ...]] = ("capture",)
     Config: ClassVar[Any] = ScaffoldConfig
     reasons: ClassVar[dict[str, str]] = {"empty": "no face is left: points too sparse, or cameras that see nothing of it"}
@@ -156,6 +157,8 @@ def _surface(
         return reconstruct.terrain(points, np.array(info.up), longest, outlier), stated, NONE
     point_normals = reconstruct.normals(points, viewers, config.neighbours)
     trim = config.trim_m * info.metre
+    if info.points == "sfm":  # these are as dense as the photos' detail, whatever a metre is
+        trim = max(trim, SPACINGS * reconstruct.spacing(points))
     if source == "distance_field":
         mesh = reconstruct.distance_field(points, point_normals, config.cell_m * info.metre, trim)
     else:

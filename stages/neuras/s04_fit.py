@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -28,10 +28,12 @@ if TYPE_CHECKING:
     from model.neuras.rays import View
     from model.neuras.scene import FitConfig
     from pipeline.store import Draft
+    from stages.graphics.cameras import Camera
     from stages.neuras.records import AtlasMesh, CaptureInfo, FrameRecord
 
 VGG_LEAST = 16  # pixels along a patch: VGG16 halves it four times
 SKY_STEP, SKY_MOST = 64, 512  # texels: a face spans two focal lengths, and a device keeps 36 faces
+BYTES = 74  # of memory that a training pixel takes: what it sees, once by photo and once in a row
 REACH = 3.0  # texels of a level around a chart that a sample may read
 
 
@@ -143,6 +145,7 @@ class Fit(RunStage):
         caster = Caster(atlas.vertices, atlas.faces)
         poses = refined_poses(inputs["scaffold"])
         photos = list(posed(frames(inputs["capture"], "train"), poses))
+        _check_memory([photo.camera for photo in photos])
         training = [_view(frame, atlas, caster) for frame in photos]
         validation = [_view(frame, atlas, caster) for frame in posed(frames(inputs["capture"], "validation"), poses)]
         if not training:
@@ -163,6 +166,20 @@ class Fit(RunStage):
         _write_curve(rows, draft.files)
         draft.note("fitting", summary)
         return ["model.json", "model.safetensors", POSES]
+
+
+def _check_memory(cameras: Sequence[Camera]) -> None:
+    """UserError where the training pixels do not fit into this machine's free memory."""
+    import psutil
+
+    needed = BYTES * sum(camera.width * camera.height for camera in cameras)
+    free = psutil.virtual_memory().available
+    if needed > free:
+        raise UserError(
+            f"{len(cameras)} training photos of up to {max(camera.width for camera in cameras)} pixels' width take about "
+            f"{needed / 1e9:.0f} GB of memory, and {free / 1e9:.0f} GB are free: make them smaller (capture.max_side=1280), or "
+            "take fewer (capture.every=2)"
+        )
 
 
 def focal_length(photos: Iterable[FrameRecord]) -> float:

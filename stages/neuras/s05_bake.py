@@ -38,7 +38,7 @@ class BakeConfig(StageConfig):
 
 class Bake(RunStage):
     name: ClassVar[str] = "bake"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas", "fit")
     Config: ClassVar[Any] = BakeConfig
     headline: ClassVar[str | None] = "site/index.html"
@@ -72,8 +72,9 @@ class Bake(RunStage):
         tiles = None
         if config.tile_m is not None:
             tiling = Tiling(config.tile_m * info.metre, config.reach_m * info.metre, config.largest)
-            tiles = cut(atlas, baked.pyramid, info.up, [view.camera for view in shown], tiling)
-        planes, folder = depth_range(atlas.vertices, info.metre), draft.files / "site"
+            tiles = cut(atlas, baked.pyramid, info.up, [view.camera for view in views], tiling)
+        planes = depth_range(atlas.vertices, info.metre, [view.camera.position for view in views])
+        folder = draft.files / "site"
         photos, summary = None, {}
         if config.residuals:
             torch.set_num_threads(1)  # of each photo: sums in another order round differently

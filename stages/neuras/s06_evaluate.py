@@ -47,7 +47,7 @@ class EvaluateConfig(StageConfig):
 
 class Evaluate(MapStage):
     name: ClassVar[str] = "evaluate"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas", "fit", "bake")
     Config: ClassVar[Any] = EvaluateConfig
     headline: ClassVar[str | None] = "report.html"
@@ -94,11 +94,13 @@ class Evaluate(MapStage):
     def open(self, config: EvaluateConfig, inputs: Inputs, environment: dict[str, Any]) -> tuple[Examiner, Photos]:
         import torch
 
+        from stages.graphics.geometry import one_thread
         from stages.neuras.evaluation.renderers import Scene
         from stages.neuras.evaluation.scores import scorers
         from stages.neuras.evaluation.views import Aligner, Examiner, Photos, warping
 
-        torch.set_num_threads(1)  # sums in another order round differently
+        one_thread()
+        torch.set_num_threads(1)
         scene, capture = Scene.of(inputs), inputs["capture"]
         reference = scene.reference()
         photos = Photos(capture, inputs["fit"])

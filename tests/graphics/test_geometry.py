@@ -4,6 +4,9 @@ ways."""
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import types
 from pathlib import Path
 
@@ -358,3 +361,16 @@ def test_gates_reject_with_a_reason(tmp_path: Path) -> None:
         with pytest.raises(Reject) as caught:
             list(remesh.process(remesh.open(config, {"collect": FakeArtifact({"a": given}, tmp_path)}, {}), Item("a")))
         assert caught.value.reason == reason and reason in Remesh.reasons
+
+
+def test_native_libraries_keep_to_one_thread_though_they_are_loaded_already():
+    program = """
+import numpy, scipy.linalg
+from threadpoolctl import threadpool_info
+from stages.graphics.geometry import one_thread
+one_thread()
+print(max(pool["num_threads"] for pool in threadpool_info()))
+"""
+    many = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "2")
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=many)
+    assert told.stdout.split() == ["1"], told.stderr

@@ -62,6 +62,18 @@ def test_lpips_equals_its_definition(tmp_path, network, monkeypatch):
     assert measured == pytest.approx(distance(tmp_path, network, a, b), rel=1e-4)
 
 
+@pytest.mark.parametrize("network", ["vgg", "alex"])
+def test_lpips_of_a_part_is_that_of_its_pixels(tmp_path, network):
+    write_weights(tmp_path, network)
+    metric, (a, b) = LPIPS.load(tmp_path, network), torch.rand(2, 1, 3, 256, 256)
+    counts = torch.zeros(256, 256, dtype=torch.bool)
+    assert metric(a, b, ~counts).item() == pytest.approx(metric(a, b).item(), rel=1e-5)
+    counts[:, :128] = True
+    left = metric(a[..., :128], b[..., :128]).item()
+    half = torch.where(counts, b, a)  # as scores are taken: what does not count is as it should be
+    assert metric(a, half, counts).item() == pytest.approx(left, rel=0.1) and metric(a, half).item() < 0.6 * left
+
+
 def test_the_gradient_goes_through_the_tone_map(tmp_path):
     """Of the LPIPS part alone, against finite differences; where the tone map clamps there is none."""
     write_weights(tmp_path, "alex")

@@ -36,6 +36,7 @@ def truth() -> Reference:
 
 class CaptureConfig(StageConfig):
     masked: bool = False  # the upper half of every frame does not count, and is white
+    beside: bool = False  # nor does the left half of the second frame
     gain: float = 1.0  # of the photos' colours
     turned: float = 0.0  # radians that the held-out frames' poses are off
 
@@ -57,6 +58,8 @@ class Capture(MapStage):
         if config.masked:
             picture[:32] = 255
             mask = encoded(np.repeat(np.arange(64)[:, None] >= 32, 96, axis=1).astype(np.uint8) * 255)
+        if config.beside and item.id == "frame-drive_01":
+            mask = encoded(np.repeat(np.arange(96)[None] >= 48, 64, axis=0).astype(np.uint8) * 255)
         depth = scene.caster.view(camera).depth
         if split == "test":
             camera = moved(camera, np.array([config.turned, -config.turned, 0, 0, 0, 0]))

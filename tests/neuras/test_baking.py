@@ -82,6 +82,17 @@ def test_a_pixel_is_the_mean_of_its_rays():
         assert np.abs(smooth - one)[covered & (centre == hit)].mean() < np.abs(smooth - one)[edges].mean()
 
 
+def test_a_mesh_is_drawn_however_far_the_cameras_are():
+    flat = scenes.atlas()
+    baked = scenes.baked(flat)
+    far = scenes.looking_at((60.0, 0.0, 20.0), size=(64, 48))
+    far = replace(far, fx=20 * far.fx, fy=20 * far.fy)
+    wanted, _ = reference(baked, flat, far)
+    for eyes, least, most in (([far.position], 0, 0.01), ([], 0.05, 1)):  # without them it is beyond the far plane
+        with drawing.Drawing(baked, flat, *drawing.depth_range(flat.vertices, 1.0, eyes)) as scene:
+            assert least <= np.abs(scene.render(far) - wanted).mean() < most
+
+
 def test_a_picture_that_opengl_cannot_hold_is_refused():
     flat = scenes.atlas()
     camera, told = scenes.looking_at((4.0, 3.0, 2.0), size=(10000, 4)), "8 rays along a pixel's side is larger than .* fit.rays"

@@ -295,7 +295,7 @@ def test_colmaps_simple_models_are_those_of_opencv():
 
 
 def test_pandaset_puts_the_point_at_its_pixel_and_sweeps_keep_out_of_the_test(tmp_path):
-    source = source_of(pandaset(tmp_path), "pandaset")
+    source = source_of(pandaset(tmp_path), "pandaset", mask_actors=False)
     assert_dots(source, tolerance=0.2)  # JPEG
     assert [id for id, group in source.items() if group == "points"] == ["points-00", "points-02", "points-04"]
     sweep = source.points("points-02")
@@ -308,7 +308,7 @@ def test_pandaset_puts_the_point_at_its_pixel_and_sweeps_keep_out_of_the_test(tm
 def test_several_cameras_of_pandaset_share_the_split_of_a_moment(tmp_path):
     pandaset(tmp_path)
     pandaset(tmp_path, camera="back_camera")
-    source = source_of(tmp_path, "pandaset", cameras=["front_camera", "back_camera"])
+    source = source_of(tmp_path, "pandaset", cameras=["front_camera", "back_camera"], mask_actors=False)
     groups = dict(source.items())
     assert len(source.shots) == 12 and groups["frame-front_camera-01"] == groups["frame-back_camera-01"] == "test"
     assert all(groups[f"frame-front_camera-{n:02d}"] == groups[f"frame-back_camera-{n:02d}"] for n in range(6))
@@ -605,11 +605,12 @@ def test_links_that_lead_out_are_not_followed(tmp_path):
 def test_a_sets_own_files_are_not_read_elsewhere(tmp_path, name, file):
     root = tmp_path / "set"
     {"nerfstudio": nerfstudio, "pandaset": pandaset, "colmap": lambda root: colmap_model(root, True)}[name](root)
-    source_of(root, name)
+    settings = {"mask_actors": False} if name == "pandaset" else {}
+    source_of(root, name, **settings)
     (root / file).rename(tmp_path / "elsewhere")
     (root / file).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(UserError, match="has no|leads out"):
-        source_of(root, name)
+        source_of(root, name, **settings)
 
 
 def test_whole_captures_that_cannot_be_read_say_why(tmp_path):
@@ -714,8 +715,59 @@ def test_boxes_that_cannot_be_read_stop_the_run_and_can_be_left_out(tmp_path, fa
     source_of(root, "pandaset", mask_actors=False)
 
 
+def test_boxes_that_are_missing_stop_the_run_and_can_be_left_out(tmp_path):
+    root = cuboids(pandaset(tmp_path))
+    (root / "annotations/cuboids/03.pkl.gz").unlink()
+    with pytest.raises(UserError, match=r"cuboids/03\.pkl\.gz.*capture.mask_actors=false"):
+        source_of(root, "pandaset")
+    source_of(root, "pandaset", mask_actors=False)
+
+
+def test_images_of_pandaset_that_were_made_smaller_are_told(tmp_path):
+    root = cuboids(pandaset(tmp_path))
+    for path in (root / "camera/front_camera").glob("*.jpg"):
+        image = Image.open(path)
+        image.resize((WIDTH * 5 // 6, HEIGHT * 5 // 6)).save(path)
+    with pytest.raises(UserError, match="made smaller than the set's 1920 x 1080"):
+        source_of(root, "pandaset")
+
+
+def test_a_place_far_from_the_origin_is_moved_to_it(tmp_path):
+    """Coordinates of a map of the earth, which float32 would round to half a metre."""
+    east = np.array([500_000.0, 4_200_000.0, 120.0])
+
+    def away(told):
+        for entry in told["frames"]:
+            matrix = np.array(entry["transform_matrix"])
+            matrix[:3, 3] += east
+            entry["transform_matrix"] = matrix.tolist()
+
+    def line(point):
+        return " ".join(f"{value:.6f}" for value in point) + "\n"
+
+    def written(root, origin):
+        corners = [POINT + origin + offset for offset in ([0, 0, 0], [20.013, 0, 0], [0, 15.017, 0])]
+        (root / "mesh.obj").write_text("".join(f"v {line(corner)}" for corner in corners) + "f 1 2 3\n")
+        told = ["ply", "format ascii 1.0", "element vertex 1", *(f"property double {axis}" for axis in "xyz"), "end_header"]
+        (root / "sparse_pc.ply").write_text("\n".join(told) + "\n" + line(POINT + origin))
+        return root
+
+    near, far = (written(nerfstudio(tmp_path / name), origin) for name, origin in (("near", 0), ("far", east)))
+    edit(far, away)
+    here, there = source_of(near), source_of(far)
+    origin = there.info().source["origin"]
+    assert np.abs(np.array(origin) - east).max() < 5 and "origin" not in here.info().source
+    apart = east - origin
+    for a, b in zip(frames_of(here), frames_of(there), strict=True):
+        assert np.allclose(a.camera.position + apart, b.camera.position, atol=1e-6)
+    assert np.allclose(here.mesh().vertices + apart, there.mesh().vertices, atol=1e-5)
+    points = [source.points(next(id for id, group in source.items() if group == "points")).points for source in (here, there)]
+    assert np.allclose(points[0] + apart, points[1], atol=1e-5)
+    assert there.info().radius == pytest.approx(here.info().radius, rel=1e-5)
+
+
 def test_boxes_are_part_of_the_key(tmp_path):
-    root, stage = pandaset(tmp_path), Capture()
+    root, stage = cuboids(pandaset(tmp_path), things=lambda number: THINGS[:1]), Capture()
 
     def items():
         return stage.identity(parse(stage.Config, {"name": "pandaset", "path": str(root)}, "capture"), hash_file)["items"]
@@ -875,7 +927,7 @@ def test_every_variants_settings_exist_and_are_the_defaults_but_for_what_it_says
     config = parse(Capture.Config, {**given, "seed": 0}, "capture")
     assert config.name == path.stem
     other = {name for name, value in config if value != type(config).model_fields[name].get_default(call_default_factory=True)}
-    assert other == ({"max_side"} if path.stem == "pandaset" else set())
+    assert other == ({"max_side"} if path.stem in ("pandaset", "images") else set())
     assert config.split == "random_half" if path.stem == "blendedmvs" else folder is False or config.split == "auto"
 
 

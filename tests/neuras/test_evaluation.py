@@ -236,6 +236,14 @@ def test_exposure_is_found_on_the_left_half_and_scored_on_the_right(run):
     assert "found on its left half" not in (plain["evaluate"].path / "files/report.html").read_text()
 
 
+@pytest.mark.parametrize("setting", ["exposure", "poses"])
+def test_a_view_whose_left_half_is_masked_tells_neither_exposure_nor_pose(run, setting):
+    artifacts, _ = run(capture={"beside": True}, evaluate=QUICK | {setting: "half"})
+    assert artifacts["evaluate"].manifest["outputs"]["rejects"] == {"masked": 1}
+    plain, _ = run(capture={"beside": True})
+    assert "frame-drive_01" in plain["evaluate"].ids() and "frame-drive_01" not in artifacts["evaluate"].ids()
+
+
 def test_a_view_is_aligned_on_the_left_half_and_scored_on_the_right(run):
     turned = {"capture": {"turned": 0.02}, "fit": {"error": 0.0}}
     plain, _ = run(**turned)

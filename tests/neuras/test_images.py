@@ -59,6 +59,15 @@ def test_photos_get_their_poses_and_one_that_cannot_be_placed_is_rejected(tmp_pa
     assert jobs[0]["one_camera"] and not jobs[0]["sequential"] and len(jobs[0]["names"]) == 7
 
 
+def test_files_that_are_no_photos_spare_the_others(tmp_path, registered):
+    photos, jobs = registered
+    (photos / "._00.png").write_bytes(b"what macOS leaves beside a photo")
+    (photos / "broken.jpg").write_bytes(b"no picture")
+    artifact = run(photos, tmp_path / "store")
+    assert len(list(frames(artifact))) == 6 and artifact.manifest["outputs"]["rejects"] == {"unreadable": 1}
+    assert len(jobs[0]["names"]) == 6 and jobs[0]["one_camera"]
+
+
 def test_every_photo_is_part_of_every_key(tmp_path, registered):
     photos, _ = registered
     stage = Capture()

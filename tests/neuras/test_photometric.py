@@ -155,6 +155,24 @@ def test_a_camera_without_a_photo_follows_those_beside_it(truth):
     assert np.allclose(photometric.follow(before[4], before, alone).camera_to_world, before[4].camera_to_world, atol=1e-3)
 
 
+SHIFT = np.array([[0, 0, 0, 0.3], [0, 0, 0, -0.1], [0, 0, 0, 0.2], [0, 0, 0, 0]])  # of a pose, in the world
+
+
+def test_a_camera_follows_those_that_look_alike(truth):
+    """On the next line of a flight cameras look the other way, and what is ahead for them is behind for it."""
+    _, photos = truth
+    here = photos[0].camera
+    back = here.camera_to_world.copy()
+    back[:3, :2] *= -1  # half a turn about the axis that it looks along
+    other_line = [replace(here, camera_to_world=back).moved(np.array([0.02 * n, 0.0, 0.0])) for n in range(1, 4)]
+    own_line = [here.moved(np.array([0.5 * n, 0.0, 0.0])) for n in range(1, 3)]
+    before = [*other_line, *own_line]
+    after = [replace(camera, camera_to_world=camera.camera_to_world + SHIFT) for camera in before]
+    assert np.allclose(photometric.follow(here, before, after).camera_to_world - here.camera_to_world, SHIFT, atol=1e-9)
+    lonely = photometric.follow(here, other_line, after[:3])  # better than nothing
+    assert np.isfinite(lonely.camera_to_world).all()
+
+
 def test_the_stage_moves_cameras_and_those_of_held_out_frames_with_them(truth):
     mesh, photos = truth
     scaffold = Folder(Record("mesh", {"mesh.npz": pack_arrays(vars(mesh)), "mesh.json": pack_json({"faces": {}})}))

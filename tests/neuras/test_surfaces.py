@@ -13,9 +13,10 @@ from stages.graphics.arrays import unpack_arrays
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster
 from stages.graphics.geometry import measure
+from stages.neuras import records, s01_scaffold
 from stages.neuras.rasterizing.footprints import footprint
 from stages.neuras.rasterizing.texels import sheet, texels
-from stages.neuras.records import CaptureInfo, Mesh
+from stages.neuras.records import CaptureInfo, FrameRecord, Mesh
 from stages.neuras.s01_scaffold import ScaffoldConfig
 from stages.neuras.s01_scaffold import _surfels as scaffold_surfels
 from stages.neuras.s03_atlas import Atlas, AtlasConfig
@@ -198,6 +199,20 @@ def test_a_surfel_is_a_square_about_its_point_and_faces_its_viewer():
     cosines = np.einsum("ij,ij->i", normals, np.repeat(towards, 2, axis=0)) / np.linalg.norm(normals, axis=1)
     assert np.allclose(cosines, 1, atol=1e-4)
     assert not len(surfels.at_points(points[:0], viewers[:0], 0.2).faces)
+
+
+def test_a_surface_reaches_as_far_as_sparse_points_are_apart(monkeypatch):
+    """Tracks of photos are as far apart as detail is, and a nominal metre says nothing of that."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-5, 5, (2000, 2)), np.zeros(2000)])
+    ahead = replace(scenes.looking_at((0.0, -8.0, 2.0)))  # no flight
+    monkeypatch.setattr(s01_scaffold, "_points", lambda capture, views: (points, points + [0.0, 0.0, 9.0]))
+    monkeypatch.setattr(records, "given_mesh", lambda capture: None)
+    info = CaptureInfo("arbitrary", 0.1, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 10.0, "sfm", "every other")
+    views = [FrameRecord("frame-0", ahead, b"", "train")]
+    mesh, stated, _ = s01_scaffold._surface(ScaffoldConfig(depth=8), None, info, views)
+    area = np.linalg.norm(measure.face_vectors(mesh.vertices.astype(float), mesh.faces), axis=1).sum() / 2
+    assert stated["source"] == "poisson" and area == pytest.approx(100, rel=0.15)
 
 
 def test_points_that_the_surface_passes_by_become_surfels():

@@ -24,6 +24,7 @@ from stages.neuras.records import AtlasMesh, CaptureInfo, FrameRecord
 from tests.neuras import line, scenes
 
 INFO = CaptureInfo("metre", 1.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 5.0, "none", "every other")
+PLANES = (0.1, 100.0)
 UP = INFO.up
 
 
@@ -66,7 +67,7 @@ def road(times: int) -> tuple[Scene, list[FrameRecord]]:
     """Balls in a row, whose texels are so fine that far ones need coarse levels, and a drive beside them."""
     flat = scenes.atlas(subdivisions=1, density=48.0)
     cameras = [scenes.looking_at((x, 4.0, 1.0), (x + 4.0, 0.0, 0.0), size=(40, 28)) for x in (-2.0, 2.0)]
-    return streaming.placed(Scene(scenes.baked(flat, networks=False), flat, INFO), photos(cameras), times)
+    return streaming.placed(Scene(scenes.baked(flat, networks=False), flat, INFO, PLANES), photos(cameras), times)
 
 
 def test_a_road_five_times_as_long_needs_the_same_memory(tmp_path):

@@ -15,8 +15,13 @@ from __future__ import annotations
 
 import os
 
+from threadpoolctl import threadpool_limits
+
 
 def one_thread() -> None:
-    """Keep native libraries to one thread in this process: workers are the parallelism. Call before importing them."""
+    """Keep native libraries to one thread in this process: workers are the parallelism, and sums in another order round
+    differently. Those that are loaded already are told, the others read the environment.
+    """
     for name in ("OMP_NUM_THREADS", "IGL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+        os.environ[name] = "1"
+    threadpool_limits(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Literal
 
@@ -35,9 +36,13 @@ def projection(camera: Camera, near: float, far: float) -> np.ndarray:
     return np.array([[x, 0, -z, 0], [0, y, -w, 0], [0, 0, *depth], [0, 0, -1, 0]])
 
 
-def depth_range(vertices: np.ndarray, metre: float) -> tuple[float, float]:
-    """Near and far plane in world units: a tenth of a metre, and beyond the mesh from anywhere within it."""
-    return 0.1 * metre, float(2 * np.linalg.norm(np.ptp(vertices, axis=0)) + metre)
+def depth_range(vertices: np.ndarray, metre: float, eyes: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Near and far plane in world units: a tenth of a metre, and beyond the mesh, from anywhere within it and from half as far
+    again as the ``eyes`` (3,).
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    away = max((float(np.linalg.norm(np.maximum(eye - low, high - eye))) for eye in eyes), default=0.0)
+    return 0.1 * metre, max(float(2 * np.linalg.norm(high - low) + metre), 1.5 * away + metre)
 
 
 def lens(camera: Camera) -> tuple[float, float, float, float]:

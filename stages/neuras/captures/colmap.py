@@ -98,7 +98,7 @@ def images(folder: Path) -> list[PosedImage]:
 
 
 def points(folder: Path, max_bytes: int) -> tuple[np.ndarray, np.ndarray]:
-    """(P,) int64 numbers and (P, 3) float32 positions of the model's points; raises Reject."""
+    """(P,) int64 numbers and (P, 3) positions of the model's points; raises Reject."""
     path = _file(folder, "points3D")
     if path.stat().st_size > max_bytes:
         raise Reject("too_large", f"{path.name} has {path.stat().st_size} bytes, over capture.max_bytes={max_bytes}")
@@ -106,7 +106,7 @@ def points(folder: Path, max_bytes: int) -> tuple[np.ndarray, np.ndarray]:
         if path.suffix == ".txt":
             rows = [row.split(maxsplit=4)[:4] for row in _text_lines(path)]
             numbers = np.array([int(row[0]) for row in rows], np.int64)
-            return numbers, np.array([row[1:4] for row in rows], np.float32).reshape(-1, 3)
+            return numbers, np.array([row[1:4] for row in rows], np.float64).reshape(-1, 3)
         return _binary_points(path)
     except (ValueError, IndexError, UserError) as error:
         raise Reject("unreadable", f"{path.name}: {str(error)[:150]}") from None
@@ -225,4 +225,4 @@ def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         source.bytes(8 * len(source.count(8)))  # the track
         numbers.append(number)
         positions.append((x, y, z))
-    return np.array(numbers, np.int64), np.array(positions, np.float32).reshape(-1, 3)
+    return np.array(numbers, np.int64), np.array(positions, np.float64).reshape(-1, 3)

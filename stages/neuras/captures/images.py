@@ -22,12 +22,14 @@ from pipeline.errors import Reject, UserError
 from stages.graphics.geometry.paths import inside
 from stages.graphics.video import frame_count, read_video
 from stages.neuras.captures import colmap, registration
+from stages.neuras.captures.pictures import size_of
 from stages.neuras.captures.sources import FEWEST, Inventory, PointSet, Shot, file_in, shot_of
 
 PHOTOS = (".jpg", ".jpeg", ".png")
 VIDEOS = (".mp4", ".mov", ".m4v")
 CUT, MODEL, JOB = "images", "sparse/0", "job.json"  # below the prepared folder
 QUALITY = 95  # of the JPEGs that a video is cut into
+LONGEST_S = 24 * 3600  # of registration
 
 
 def root_of(path: str | None) -> Path:
@@ -49,6 +51,7 @@ def read(config: Any, root: Path, prepared: Path | None = None) -> Inventory:
     def fill(shot: Shot) -> None:
         if where is not None:
             shot.image = file_in(where, shot.name, "image")
+            size_of(shot.image)
         if folder is not None:
             if shot.name not in placed:
                 raise Reject("no_pose", "pycolmap could not place it among the others: blurred, or without overlap")
@@ -76,18 +79,24 @@ def prepare(config: Any, root: Path, folder: Path) -> None:
     if root.is_file():
         _cut(root, folder, names)
     images = folder if root.is_file() else root
-    sizes = {Image.open(images / name).size for name in names}
+    sizes = _sizes(images, names, config.max_pixels)
     job = {
         "images": str(images.resolve()),
-        "names": names,
-        "one_camera": len(sizes) == 1,
+        "names": list(sizes),
+        "one_camera": len(set(sizes.values())) == 1,
         "sequential": root.is_file(),
         "side": config.sfm_side,
         "folder": str(folder.resolve()),
     }
     (folder / JOB).write_text(json.dumps(job))
     command = [sys.executable, "-P", registration.__file__, str(folder / JOB)]
-    done = subprocess.run(command, capture_output=True, text=True)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S)
+    except subprocess.TimeoutExpired:
+        raise UserError(
+            f"pycolmap did not end within {LONGEST_S // 3600} hours: take fewer images, or register them on a faster machine "
+            "and use capture=colmap"
+        ) from None
     if done.returncode:
         last = (done.stderr.strip() or "no word").splitlines()[-1][:200]
         raise UserError(f"pycolmap ended with status {done.returncode}: {last}; capture=colmap takes a model made elsewhere")
@@ -109,11 +118,25 @@ def _names(config: Any, root: Path) -> list[str]:
         return [f"{CUT}/frame_{number:04d}.jpg" for number in range(min(config.video_frames, frame_count(root)))]
     found = sorted(path for path in root.rglob("*") if path.suffix.lower() in PHOTOS and path.is_file())
     names = [path.relative_to(root).as_posix() for path in found if inside(path, root)]
+    names = [name for name in names if not any(part.startswith(".") for part in name.split("/"))]  # such as macOS's ._IMG.jpg
     if len(names) < FEWEST:
         raise UserError(
             f"capture.path={str(root)!r} holds {len(names)} photos ({', '.join(PHOTOS)}), at least {FEWEST} are needed"
         )
     return names
+
+
+def _sizes(folder: Path, names: list[str], most: int) -> dict[str, tuple[int, int]]:
+    """Width and height of the images that can be read and have at most so many pixels; the others are rejected later."""
+    sizes = {}
+    for name in names:
+        try:
+            width, height = size_of(folder / name)
+        except Reject:
+            continue
+        if width * height <= most:
+            sizes[name] = (width, height)
+    return sizes
 
 
 def _cut(video: Path, folder: Path, names: list[str]) -> None:

@@ -134,9 +134,9 @@ def _points(config: FolderConfig, root: Path, told: dict[str, Any]) -> list[Poin
 
 
 def ply_points(path: Path, max_bytes: int) -> np.ndarray:
-    """(P, 3) float32: the vertices of a PLY; raises Reject."""
+    """(P, 3): the vertices of a PLY; raises Reject."""
     source = Source(path, path.parent, max_bytes, 1 << 40)
     with at(path.name):
         if path.stat().st_size > max_bytes:
             raise Reject("too_large", f"{path.stat().st_size} bytes, at most {max_bytes} are read")
-        return ply.read_points(path.read_bytes(), source).astype(np.float32)
+        return ply.read_points(path.read_bytes(), source)

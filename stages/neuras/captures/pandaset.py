@@ -28,19 +28,20 @@ COLUMNS = ("position.x", "position.y", "position.z", "dimensions.x", "dimensions
 MOTION = "attributes.object_motion"
 MARGIN_M = 0.25  # around a box: its edges are rough, and wheels and mirrors stand out
 MOST_BOXES = 10_000  # of a frame
+ASIDE = 0.09  # of a picture's side, from its middle to the principal point: the set's own lie within 0.071
 
 Boxes = dict[int, list[Box]]  # of actors, by frame
 
 
 def read(config: Any, root: Path) -> Inventory:
     """The inventory of the cameras that ``config.cameras`` names. A sweep shares the moment of the frames of its number."""
-    boxes = _actors(root) if config.mask_actors else {}
+    boxes = _actors(root) if config.mask_actors else None
     shots = [shot for camera in config.cameras for shot in _shots(root, camera, boxes)]
-    sweeps = _sweeps(root, boxes)
+    sweeps = _sweeps(root, boxes or {})
     return Inventory(shots, sweeps, "lidar" if sweeps else "none", "metre", "PandaSet is in metres", (0.0, 0.0, 1.0))
 
 
-def _shots(root: Path, camera: str, boxes: Boxes) -> list[Shot]:
+def _shots(root: Path, camera: str, boxes: Boxes | None) -> list[Shot]:
     folder = root / "camera" / camera
     if "/" in camera or camera.startswith(".") or not folder.is_dir():
         known = sorted(path.name for path in (root / "camera").glob("*") if path.is_dir())
@@ -51,7 +52,12 @@ def _shots(root: Path, camera: str, boxes: Boxes) -> list[Shot]:
         raise UserError(f"{folder}: timestamps.json must hold one number for each of the {len(placed)} poses")
     shots = []
     for index, (pose, time) in enumerate(zip(placed, times, strict=True)):
-        fill = partial(_fill, root, pose, intrinsics, boxes.get(index, []))
+        if boxes is not None and index not in boxes:
+            raise UserError(
+                f"{str(root)!r} has no annotations/cuboids/{index:02d}.pkl.gz, so what moves in that frame cannot be masked: "
+                "unpack the annotations too; capture.mask_actors=false does without"
+            )
+        fill = partial(_fill, root, pose, intrinsics, (boxes or {}).get(index, []))
         shot = shot_of(f"camera/{camera}/{index:02d}.jpg", fill)
         shot.moment, shot.time, shot.meta = index, float(time), {"camera": camera}
         shots.append(shot)
@@ -145,6 +151,10 @@ def _lens(told: dict[str, Any], width: int, height: int) -> Lens:
         lens = Lens(width, height, float(told["fx"]), float(told["fy"]), float(told["cx"]) + 0.5, float(told["cy"]) + 0.5)
     except (KeyError, TypeError, ValueError):
         raise Reject("no_intrinsics", "intrinsics.json has no numbers fx, fy, cx, cy") from None
-    if lens.wrong():
-        raise Reject("no_intrinsics", f"{lens.wrong()}: the images may have been made smaller than the set's 1920 x 1080")
+    aside = max(abs(lens.cx / width - 0.5), abs(lens.cy / height - 0.5))
+    why = lens.wrong()
+    if why is None and aside > ASIDE:
+        why = f"the principal point ({lens.cx:g}, {lens.cy:g}) is far from the middle of {width} x {height} pixels"
+    if why is not None:
+        raise Reject("no_intrinsics", f"{why}: the images may have been made smaller than the set's 1920 x 1080")
     return lens

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, Protocol
@@ -28,6 +28,7 @@ from stages.neuras.captures.lenses import Lens
 from stages.neuras.records import FRAME, POINTS, CaptureInfo, FrameRecord, Mesh, PointsRecord, Split
 
 FEWEST = 3  # usable frames
+FAR_AWAY = 10_000.0  # world units from the origin, beyond which a small place is moved to it
 SEEN = 50_000  # points that decide the capture's ball
 AXES = {sign + name: tuple((-1.0 if sign else 1.0) * (name == axis) for axis in "xyz") for name in "xyz" for sign in ("", "-")}
 
@@ -96,7 +97,8 @@ class Shot:
 
 @dataclass
 class PointSet:
-    """Points, read when they are asked for. read: (P, 3) float32 and the sensor's position (3,) or None. file: if it is one's.
+    """Points, read when they are asked for. read: (P, 3) and the sensor's position (3,) or None, as the set has them. file: if
+    it is one's.
 
     moment: of the frames that were taken with it; None for what belongs to no one time. facts: what decides the points
     besides the file.
@@ -183,6 +185,12 @@ class FolderSource:
         self.sets = {f"{POINTS}{it.name}": it for it in self.inventory.sets if it.moment is None or it.moment not in held}
         self.mesh_files = _mesh_files(config, self.root) or self.inventory.mesh
         self._check()
+        self.origin = _origin([shot.camera_to_world for shot in chosen if shot.fault is None])
+        if self.origin.any():
+            for shot in chosen:
+                if shot.fault is None:
+                    shot.camera_to_world = shot.camera_to_world.copy()
+                    shot.camera_to_world[:3, 3] -= self.origin
 
     def items(self) -> list[tuple[str, str]]:
         return [*self.splits.items(), *((id, "points") for id in self.sets)]
@@ -203,7 +211,8 @@ class FolderSource:
         finite = np.isfinite(points).all(axis=1)
         if not finite.any():
             raise Reject("no_points", f"{id} holds no point")
-        return PointsRecord(id, points[finite].astype(np.float32), sensor)
+        here = (points[finite] - self.origin).astype(np.float32)
+        return PointsRecord(id, here, None if sensor is None else (sensor - self.origin).astype(np.float32))
 
     def mesh(self) -> Mesh | None:
         """The given mesh; UserError where it is none."""
@@ -219,7 +228,7 @@ class FolderSource:
             return None
         if (number := sum(map(len, faces))) > self.config.max_faces:
             raise UserError(f"the mesh has {number:,} faces, over capture.max_faces={self.config.max_faces:,}")
-        return Mesh(np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32))
+        return Mesh((np.concatenate(vertices) - self.origin).astype(np.float32), np.concatenate(faces).astype(np.int32))
 
     def info(self) -> CaptureInfo:
         config, inventory = self.config, self.inventory
@@ -241,7 +250,8 @@ class FolderSource:
                 "kind": config.name,
                 "units_from": "capture.units" if config.units != "auto" else inventory.units_from,
                 "up_from": up_from,
-            },
+            }
+            | ({"origin": self.origin.tolist()} if self.origin.any() else {}),
         )
 
     def hashes(self, hash_file: Callable[[Any], str]) -> dict[str, Any]:
@@ -297,6 +307,17 @@ class FolderSource:
             f"{len(usable)} usable frames are too few, at least {FEWEST} are needed to learn from some and to test on others: "
             f"take more images, or keep more of them (capture.every={self.config.every}; {told}{first})"
         )
+
+
+def _origin(poses: Sequence[np.ndarray | None]) -> np.ndarray:
+    """(3,) float64: what is taken from all coordinates. 0 but for places on a map of the earth, millions of metres from its
+    origin: meshes and points are float32, which would round them to decimetres.
+    """
+    positions = np.array([pose[:3, 3] for pose in poses if pose is not None]).reshape(-1, 3)
+    if not len(positions):  # of photos that were not placed yet
+        return np.zeros(3)
+    away, wide = np.abs(positions).max(), np.ptp(positions, axis=0).max()
+    return positions.mean(axis=0).round() if away > max(FAR_AWAY, 1000 * wide) else np.zeros(3)
 
 
 def _plain(value: Any) -> Any:

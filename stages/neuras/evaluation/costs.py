@@ -43,7 +43,7 @@ def plain(scene: Scene) -> Scene:
         mesh_features=np.clip(finest, 0, 1).astype(np.float16),
         sky_features=np.zeros((1, 6, side, side, 3), np.float16),
     )
-    return Scene(colours, scene.atlas, scene.info)
+    return Scene(colours, scene.atlas, scene.info, scene.planes)
 
 
 def frame_times(drawing: Drawing, cameras: Sequence[Camera]) -> list[float]:

@@ -5,6 +5,7 @@ Both have ``render(camera)``, which gives (H, W, 3) float32 in [0, 1].
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -63,21 +64,27 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is drawn: the fitted maps and networks, the mesh that they lie on, facts of the capture, and residuals of photos."""
+    """What is drawn: the fitted maps and networks, the mesh that they lie on, facts of the capture, residuals of photos, and
+    the near and far plane, world units.
+    """
 
     baked: Baked
     atlas: AtlasMesh
     info: CaptureInfo
+    planes: tuple[float, float]
     residuals: Residuals | None = None
 
     @classmethod
     def of(cls, inputs: Mapping[str, Artifact]) -> Scene:
         """Of artifacts by role: capture, atlas, fit, bake."""
+        site = inputs["bake"].file("site")
+        about = json.loads((site / "scene.json").read_bytes())
         return cls(
             Baked.load(inputs["fit"].path / "files"),
             load_atlas(inputs["atlas"].file("atlas.npz")),
             CaptureInfo.of(inputs["capture"]),
-            Residuals.load(inputs["bake"].file("site")),
+            (about["near"], about["far"]),
+            Residuals.load(site),
         )
 
     def reference(self) -> Reference:
@@ -85,8 +92,7 @@ class Scene:
 
     def drawing(self, texture_format: drawing.TextureFormat = "fp16") -> drawing.Drawing:
         """By OpenGL; UserError where the machine has none."""
-        planes = drawing.depth_range(self.atlas.vertices, self.info.metre)
-        return drawing.Drawing(self.baked, self.atlas, *planes, texture_format, self.residuals)
+        return drawing.Drawing(self.baked, self.atlas, *self.planes, texture_format, self.residuals)
 
 
 def opengl() -> str | None:

@@ -58,7 +58,7 @@ def _lpips(network: str, folder: str | None) -> Scorer:
     def score(photo: np.ndarray, picture: np.ndarray, counts: np.ndarray) -> float:
         images = [torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None] for image in (photo, picture)]
         with torch.no_grad():
-            return float(distance(*images))
+            return float(distance(*images, None if counts.all() else torch.from_numpy(counts)))
 
     return score
 

@@ -74,8 +74,10 @@ class Examiner:
 
     def examine(self, frame: FrameRecord) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """What is measured of the view, as plain JSON, and its pictures by name, (H, W, 3) uint8."""
-        photo, counts = frame.image(), _counts(frame)
+        photo, counts = frame.image(), _enough(frame.counts(), "it")
         known, unknown = (counts & half for half in halves(counts.shape))
+        if self.exposure or self.aligner is not None:
+            known, unknown = _enough(known, "its left half"), _enough(unknown, "its right half")
         if self.aligner is not None:
             frame = replace(frame, camera=self.aligner.align(frame.camera, photo, known))
         exact = self.reference.pictures(frame.camera)
@@ -125,10 +127,9 @@ def difference(photo: np.ndarray, picture: np.ndarray, counts: np.ndarray) -> np
     return np.where(counts[..., None], np.minimum(apart, 255), 0).astype(np.uint8)
 
 
-def _counts(frame: FrameRecord) -> np.ndarray:
-    """The frame's mask; Reject where it leaves almost nothing of what SSIM averages over."""
-    counts = frame.counts()
+def _enough(counts: np.ndarray, of: str) -> np.ndarray:
+    """``counts``, a mask; Reject where it leaves almost nothing of what SSIM averages over."""
     border = SSIM_MIN_SIZE // 2
     if counts[border:-border, border:-border].mean() < LEAST:
-        raise Reject("masked", f"{100 * counts.mean():.1f} % of its pixels are left")
+        raise Reject("masked", f"of {of} the mask leaves {100 * counts.mean():.1f} % of the frame's pixels")
     return counts

@@ -29,6 +29,7 @@ WHOLE = 0.95  # share of the neighbourhood that must count
 ROBUST = 0.5  # of normalised luminance: larger differences count less and less (Geman-McClure)
 BEHIND = 0.01  # share of its distance that a point may lie behind the surface and still be seen
 FOLLOWED = 2  # cameras that one without a photo follows
+ALIKE = np.radians(45)  # between the axes of cameras that look alike
 LONGEST = 3.0  # sigmas of the level that a step moves a vertex at most, in pixels
 
 
@@ -88,9 +89,12 @@ def refine(
 def follow(camera: Camera, before: Sequence[Camera], after: Sequence[Camera]) -> Camera:
     """``camera`` with the motion of the two nearest cameras of ``before``, which went to ``after``; the nearer weighs more.
 
-    Errors of poses change slowly along a drive, so a camera whose photo nobody looks at shares those of its neighbours.
+    Errors of poses change slowly along a drive, so a camera whose photo nobody looks at shares those of its neighbours. Motions
+    are along a camera's own axes, so cameras that look alike are asked, where there are any: not those of the next, opposite
+    line of a flight, or of another camera of a car.
     """
-    near = nearest(before, camera.position, FOLLOWED)
+    alike = [number for number, other in enumerate(before) if _turn(camera, other) < ALIKE] or list(range(len(before)))
+    near = [alike[number] for number in nearest([before[number] for number in alike], camera.position, FOLLOWED)]
     away = np.array([np.linalg.norm(before[number].position - camera.position) for number in near])
     weights = 1 / np.maximum(away, 1e-3 * max(away.max(), 1e-9))
     motions = np.array([motion_between(before[number], after[number]) for number in near])
@@ -345,6 +349,11 @@ def motion_between(before: Camera, after: Camera) -> np.ndarray:
     turn = before.camera_to_world[:3, :3].T
     rotation = Rotation.from_matrix(turn @ after.camera_to_world[:3, :3]).as_rotvec()
     return np.concatenate([rotation, turn @ (after.position - before.position)])
+
+
+def _turn(one: Camera, other: Camera) -> float:
+    """Radians from the axes of one camera to those of the other."""
+    return float(Rotation.from_matrix(one.camera_to_world[:3, :3].T @ other.camera_to_world[:3, :3]).magnitude())
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:

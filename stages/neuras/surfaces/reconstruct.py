@@ -28,6 +28,11 @@ def _strides(cells: np.ndarray) -> np.ndarray:
     return np.array([1, width, width * depth], np.int64)
 
 
+def spacing(points: np.ndarray) -> float:
+    """The median distance of a point from the nearest other one."""
+    return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
+
+
 def normals(points: np.ndarray, viewers: np.ndarray, neighbours: int) -> np.ndarray:
     """(P, 3) unit normals: the least axis of each point's nearest neighbours, turned towards ``viewers`` (P, 3)."""
     tree = cKDTree(points)

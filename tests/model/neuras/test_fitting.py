@@ -386,6 +386,37 @@ def test_masked_pixels_teach_nothing(tmp_path):
     assert (tmp_path / "out0" / "model.safetensors").read_bytes() == (tmp_path / "out255" / "model.safetensors").read_bytes()
 
 
+@pytest.mark.parametrize("codes", [128, 0])
+@pytest.mark.parametrize("seen", ["mesh", "sky"])
+def test_a_scene_whose_photos_show_the_mesh_alone_or_none_of_it_is_learned(tmp_path, seen, codes):
+    """A flight that looks straight down, masks without sky, masks of all that the mesh holds."""
+
+    def part(one: View) -> View:
+        return dataclasses.replace(one, counts=one.hit if seen == "mesh" else ~one.hit)
+
+    baked = run(tmp_path, dataclasses.replace(CONFIG, codes=codes), [part(view(x)) for x in np.linspace(-1.5, 1.5, 6)])[0]
+    other = view(0.07)
+    colours, opacity = rendered(baked, other)
+    known = part(other).counts.ravel()
+    truth = other.rgb.reshape(-1, 3) / 255
+    assert np.square(colours - truth)[known].mean() < 0.01
+    assert np.allclose(colours[~known], truth[known].mean(axis=0), atol=0.15)  # the photos' mean, and no hole
+    if seen == "mesh":
+        assert opacity[~known].min() < 1.01  # skyboxes stay as they are made
+
+
+def test_frames_that_masks_hide_are_no_part_of_the_validation(tmp_path):
+    hidden = dataclasses.replace(view(1.0), counts=np.zeros((32, 32), bool))
+    said: list[str] = []
+    outputs = fitting.Outputs(tmp_path, said.append, None)
+    training = [view(x) for x in (0.0, 0.5)]
+    quick = dataclasses.replace(CONFIG, steps=3, validate_every=0)
+    _, summary = fitting.fit(quick, surroundings(), training, [view(0.07), hidden], outputs)
+    assert np.isfinite(summary["psnr"]) and "over 1 views" in said[-1]
+    outputs = fitting.Outputs(tmp_path / "none", said.append, None)
+    assert "psnr" not in fitting.fit(quick, surroundings(), training, [hidden], outputs)[1]
+
+
 def test_an_epoch_goes_through_every_pixel_and_steps_are_a_pure_function():
     pixels = Pixels([view(0.0), view(1.0)], np.zeros(3), 4, torch.device("cpu"))
     views, corners = pixels._epoch(0, 0)
