@@ -584,6 +584,14 @@ def test_a_frames_fault_has_its_reason_and_spares_the_others(tmp_path, reason):
     assert list(told.values()) == [reason.strip()] and reason.strip() in Capture.reasons
 
 
+def test_integers_of_hundreds_of_digits_are_a_frames_fault(tmp_path):
+    huge = 10**400
+    change = {1: {"transform_matrix": [[huge] * 4] * 4}, 3: {"w": huge}, 5: {"time": huge}}
+    source = source_of(nerfstudio(tmp_path, each=lambda number: change.get(number, {})))
+    reasons = {id: shot.fault.reason for id, shot in source.shots.items() if shot.fault}
+    assert reasons == {"frame-01": "no_pose", "frame-03": "no_intrinsics"}
+
+
 def test_a_picture_over_the_limit_is_not_decoded(tmp_path):
     with pytest.raises(Reject, match="capture.max_pixels=1000"):
         source_of(nerfstudio(tmp_path), max_pixels=1000).frame("frame-00")

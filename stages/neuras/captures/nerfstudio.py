@@ -78,7 +78,7 @@ def _lens(told: dict[str, Any]) -> Lens:
         raise Reject("no_intrinsics", f"{', '.join(missing)} not given, neither by the file nor by the frame")
     try:
         value = {name: float(told[name]) for name in ("fl_x", "fl_y", "cx", "cy", *TERMS) if told.get(name) is not None}
-        width, height = int(told["w"]), int(told["h"])
+        width, height = (int(float(told[name])) for name in ("w", "h"))
     except (TypeError, ValueError, OverflowError):
         raise Reject("no_intrinsics", "an intrinsic is not a number") from None
     if value.get("k4"):
@@ -106,7 +106,10 @@ def _named(told: dict[str, Any]) -> dict[str, Any]:
 
 def _time(frame: dict[str, Any]) -> float | None:
     time = frame.get("time")
-    return float(time) if isinstance(time, (int, float)) and np.isfinite(time) else None
+    try:
+        return float(time) if isinstance(time, (int, float)) and np.isfinite(float(time)) else None
+    except OverflowError:  # an integer of hundreds of digits
+        return None
 
 
 def _units(told: dict[str, Any]) -> tuple[Any, str]:

@@ -18,7 +18,7 @@ def checked(matrix: Any) -> np.ndarray:
     """A camera-to-world matrix (4, 4) or (3, 4), OpenGL camera, as exactly rigid (4, 4) float64; Reject if it is none."""
     try:
         given = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise Reject("no_pose", "its matrix does not hold numbers") from None
     if given.shape not in ((4, 4), (3, 4)):
         raise Reject("no_pose", f"its matrix has the shape {given.shape}, not (4, 4)")
