@@ -157,10 +157,12 @@ def _surface(
         return reconstruct.terrain(points, np.array(info.up), longest, outlier), stated, NONE
     point_normals = reconstruct.normals(points, viewers, config.neighbours)
     trim = config.trim_m * info.metre
+    cell = config.cell_m * info.metre
     if info.points == "sfm":  # these are as dense as the photos' detail, whatever a metre is
-        trim = max(trim, SPACINGS * reconstruct.spacing(points))
+        reach = max(trim, SPACINGS * reconstruct.spacing(points))
+        trim, cell = reach, cell * reach / trim
     if source == "distance_field":
-        mesh = reconstruct.distance_field(points, point_normals, config.cell_m * info.metre, trim)
+        mesh = reconstruct.distance_field(points, point_normals, cell, trim)
     else:
         mesh = reconstruct.poisson(points, point_normals, config.depth, trim)
     if config.carve and info.points == "lidar":

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 VGG_LEAST = 16  # pixels along a patch: VGG16 halves it four times
 SKY_STEP, SKY_MOST = 64, 512  # texels: a face spans two focal lengths, and a device keeps 36 faces
-BYTES = 74  # of memory that a training pixel takes: what it sees, once by photo and once in a row
+BYTES = 37  # of what a pixel sees
 REACH = 3.0  # texels of a level around a chart that a sample may read
 
 
@@ -144,10 +144,10 @@ class Fit(RunStage):
         atlas = load_atlas(inputs["atlas"].file("atlas.npz"))
         caster = Caster(atlas.vertices, atlas.faces)
         poses = refined_poses(inputs["scaffold"])
-        photos = list(posed(frames(inputs["capture"], "train"), poses))
-        _check_memory([photo.camera for photo in photos])
-        training = [_view(frame, atlas, caster) for frame in photos]
-        validation = [_view(frame, atlas, caster) for frame in posed(frames(inputs["capture"], "validation"), poses)]
+        device = choose_device(config.device, "fit.device")
+        photos, held_out = (list(posed(frames(inputs["capture"], split), poses)) for split in ("train", "validation"))
+        _check_memory([photo.camera for photo in photos + held_out], device == "cpu")
+        training, validation = ([_view(frame, atlas, caster) for frame in part] for part in (photos, held_out))
         if not training:
             raise UserError("the capture has no training frame: look at its split")
         outputs = Outputs(
@@ -157,7 +157,6 @@ class Fit(RunStage):
             tensorboard=draft.files / "tensorboard" if config.tensorboard else None,
         )
         surroundings = _surroundings(config, info, atlas, [view.origin for view in training + validation])
-        device = choose_device(config.device, "fit.device")
         fitting = config.fit(info.metre, focal_length(photos))
         baked, summary = fit(fitting, surroundings, training, validation, outputs, device)
         baked.save(draft.files)
@@ -168,15 +167,17 @@ class Fit(RunStage):
         return ["model.json", "model.safetensors", POSES]
 
 
-def _check_memory(cameras: Sequence[Camera]) -> None:
-    """UserError where the training pixels do not fit into this machine's free memory."""
+def _check_memory(cameras: Sequence[Camera], on_cpu: bool) -> None:
+    """UserError where what the photos' pixels see does not fit into this machine's free memory: once by photo, and in a row,
+    on the device.
+    """
     import psutil
 
-    needed = BYTES * sum(camera.width * camera.height for camera in cameras)
+    needed = BYTES * (2 if on_cpu else 1) * sum(camera.width * camera.height for camera in cameras)
     free = psutil.virtual_memory().available
     if needed > free:
         raise UserError(
-            f"{len(cameras)} training photos of up to {max(camera.width for camera in cameras)} pixels' width take about "
+            f"{len(cameras)} photos of up to {max(camera.width for camera in cameras)} pixels' width take about "
             f"{needed / 1e9:.0f} GB of memory, and {free / 1e9:.0f} GB are free: make them smaller (capture.max_side=1280), or "
             "take fewer (capture.every=2)"
         )

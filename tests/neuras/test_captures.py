@@ -733,9 +733,10 @@ def test_boxes_that_are_missing_stop_the_run_and_can_be_left_out(tmp_path):
 
 def test_images_of_pandaset_that_were_made_smaller_are_told(tmp_path):
     root = cuboids(pandaset(tmp_path))
-    for path in (root / "camera/front_camera").glob("*.jpg"):
-        image = Image.open(path)
-        image.resize((WIDTH * 5 // 6, HEIGHT * 5 // 6)).save(path)
+    folder = root / "camera/front_camera"
+    (folder / "intrinsics.json").write_text(json.dumps({"fx": 1970.0, "fy": 1970.0, "cx": 970.0, "cy": 483.3}))
+    for path in folder.glob("*.jpg"):
+        Image.new("RGB", (1728, 972)).save(path)
     with pytest.raises(UserError, match="made smaller than the set's 1920 x 1080"):
         source_of(root, "pandaset")
 
@@ -772,6 +773,8 @@ def test_a_place_far_from_the_origin_is_moved_to_it(tmp_path):
     points = [source.points(next(id for id, group in source.items() if group == "points")).points for source in (here, there)]
     assert np.allclose(points[0] + apart, points[1], atol=1e-5)
     assert there.info().radius == pytest.approx(here.info().radius, rel=1e-5)
+    keys = [source.hashes(lambda path: "content")["told"] for source in (here, there)]
+    assert keys[0] != keys[1] and keys[1]["origin"] == origin  # points would stay behind their cameras
 
 
 def test_boxes_are_part_of_the_key(tmp_path):

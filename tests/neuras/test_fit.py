@@ -24,6 +24,7 @@ from stages.graphics.arrays import pack_json
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster
 from stages.graphics.page import png
+from stages.neuras import s04_fit
 from stages.neuras.evaluation.renderers import Reference
 from stages.neuras.records import FRAME, CaptureInfo, FrameRecord, save
 from stages.neuras.s04_fit import Fit, FitStageConfig
@@ -270,3 +271,11 @@ def test_every_setting_reaches_the_loop():
     names = {field.name for kind in (FitConfig, ShaderConfig) for field in dataclasses.fields(kind)}
     assert names - set(FitStageConfig.model_fields) == {"shader", "voxel"}
     assert FitStageConfig(voxel_m=0.5).fit(metre=2.0, focal=300).voxel == 1.0
+
+
+def test_photos_that_do_not_fit_into_memory_are_told_before_they_are_read(monkeypatch):
+    cameras = [Camera.from_fov(4000, 3000, 60, np.eye(4))] * 50
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=30e9))
+    with pytest.raises(UserError, match=r"44 GB of memory, and 30 GB are free.*capture.max_side"):
+        s04_fit._check_memory(cameras, on_cpu=True)
+    s04_fit._check_memory(cameras, on_cpu=False)  # half of it is on the device

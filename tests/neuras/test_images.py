@@ -63,8 +63,10 @@ def test_files_that_are_no_photos_spare_the_others(tmp_path, registered):
     photos, jobs = registered
     (photos / "._00.png").write_bytes(b"what macOS leaves beside a photo")
     (photos / "broken.jpg").write_bytes(b"no picture")
-    artifact = run(photos, tmp_path / "store")
-    assert len(list(frames(artifact))) == 6 and artifact.manifest["outputs"]["rejects"] == {"unreadable": 1}
+    Image.new("L", (700, 700)).save(photos / "huge.png")
+    artifact = run(photos, tmp_path / "store", max_pixels=400_000)
+    rejects = artifact.manifest["outputs"]["rejects"]
+    assert len(list(frames(artifact))) == 6 and rejects == {"unreadable": 1, "too_large": 1}
     assert len(jobs[0]["names"]) == 6 and jobs[0]["one_camera"]
 
 

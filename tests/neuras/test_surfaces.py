@@ -201,7 +201,8 @@ def test_a_surfel_is_a_square_about_its_point_and_faces_its_viewer():
     assert not len(surfels.at_points(points[:0], viewers[:0], 0.2).faces)
 
 
-def test_a_surface_reaches_as_far_as_sparse_points_are_apart(monkeypatch):
+@pytest.mark.parametrize("source", ["auto", "distance_field"])
+def test_a_surface_reaches_as_far_as_sparse_points_are_apart(monkeypatch, source):
     """Tracks of photos are as far apart as detail is, and a nominal metre says nothing of that."""
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-5, 5, (2000, 2)), np.zeros(2000)])
@@ -210,9 +211,9 @@ def test_a_surface_reaches_as_far_as_sparse_points_are_apart(monkeypatch):
     monkeypatch.setattr(records, "given_mesh", lambda capture: None)
     info = CaptureInfo("arbitrary", 0.1, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 10.0, "sfm", "every other")
     views = [FrameRecord("frame-0", ahead, b"", "train")]
-    mesh, stated, _ = s01_scaffold._surface(ScaffoldConfig(depth=8), None, info, views)
+    mesh, stated, _ = s01_scaffold._surface(ScaffoldConfig(depth=8, source=source), None, info, views)
     area = np.linalg.norm(measure.face_vectors(mesh.vertices.astype(float), mesh.faces), axis=1).sum() / 2
-    assert stated["source"] == "poisson" and area == pytest.approx(100, rel=0.15)
+    assert stated["source"] == {"auto": "poisson"}.get(source, source) and area == pytest.approx(100, rel=0.15)
 
 
 def test_points_that_the_surface_passes_by_become_surfels():

@@ -51,7 +51,9 @@ def read(config: Any, root: Path, prepared: Path | None = None) -> Inventory:
     def fill(shot: Shot) -> None:
         if where is not None:
             shot.image = file_in(where, shot.name, "image")
-            size_of(shot.image)
+            width, height = size_of(shot.image)
+            if width * height > config.max_pixels:
+                raise Reject("too_large", f"{width} x {height} pixels are over capture.max_pixels={config.max_pixels}")
         if folder is not None:
             if shot.name not in placed:
                 raise Reject("no_pose", "pycolmap could not place it among the others: blurred, or without overlap")
@@ -80,6 +82,11 @@ def prepare(config: Any, root: Path, folder: Path) -> None:
         _cut(root, folder, names)
     images = folder if root.is_file() else root
     sizes = _sizes(images, names, config.max_pixels)
+    if len(sizes) < FEWEST:
+        raise UserError(
+            f"of {len(names)} images {len(sizes)} can be read and have at most capture.max_pixels={config.max_pixels} pixels; "
+            f"{FEWEST} are needed"
+        )
     job = {
         "images": str(images.resolve()),
         "names": list(sizes),

@@ -28,7 +28,8 @@ COLUMNS = ("position.x", "position.y", "position.z", "dimensions.x", "dimensions
 MOTION = "attributes.object_motion"
 MARGIN_M = 0.25  # around a box: its edges are rough, and wheels and mirrors stand out
 MOST_BOXES = 10_000  # of a frame
-ASIDE = 0.09  # of a picture's side, from its middle to the principal point: the set's own lie within 0.071
+SIZE = (1920, 1080)  # of its images, in pixels
+MIDDLE = 800  # a principal point farther right than this is for that size
 
 Boxes = dict[int, list[Box]]  # of actors, by frame
 
@@ -48,7 +49,7 @@ def _shots(root: Path, camera: str, boxes: Boxes | None) -> list[Shot]:
         raise UserError(f"capture.cameras: {str(root)!r} has no camera {camera!r}; it has {', '.join(known) or 'none'}")
     placed, intrinsics = json_in(root, folder / "poses.json", list), json_in(root, folder / "intrinsics.json", dict)
     times = json_in(root, folder / "timestamps.json", list)
-    if len(times) != len(placed) or not all(isinstance(time, (int, float)) for time in times):
+    if len(times) != len(placed) or not all(isinstance(time, (int, float)) and abs(time) < 1e300 for time in times):
         raise UserError(f"{folder}: timestamps.json must hold one number for each of the {len(placed)} poses")
     shots = []
     for index, (pose, time) in enumerate(zip(placed, times, strict=True)):
@@ -142,19 +143,18 @@ def _pose(told: Any) -> tuple[list[float], list[float]]:
     """(position, heading wxyz) of an entry; raises Reject."""
     try:
         return [float(told["position"][axis]) for axis in "xyz"], [float(told["heading"][axis]) for axis in "wxyz"]
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise Reject("no_pose", "its pose has no position x, y, z and heading w, x, y, z") from None
 
 
 def _lens(told: dict[str, Any], width: int, height: int) -> Lens:
     try:
         lens = Lens(width, height, float(told["fx"]), float(told["fy"]), float(told["cx"]) + 0.5, float(told["cy"]) + 0.5)
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise Reject("no_intrinsics", "intrinsics.json has no numbers fx, fy, cx, cy") from None
-    aside = max(abs(lens.cx / width - 0.5), abs(lens.cy / height - 0.5))
     why = lens.wrong()
-    if why is None and aside > ASIDE:
-        why = f"the principal point ({lens.cx:g}, {lens.cy:g}) is far from the middle of {width} x {height} pixels"
+    if why is None and lens.cx > MIDDLE and (width, height) != SIZE:
+        why = f"the principal point ({lens.cx:g}, {lens.cy:g}) is for another size than {width} x {height} pixels"
     if why is not None:
         raise Reject("no_intrinsics", f"{why}: the images may have been made smaller than the set's 1920 x 1080")
     return lens

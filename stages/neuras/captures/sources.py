@@ -208,10 +208,11 @@ class FolderSource:
 
     def points(self, id: str) -> PointsRecord:
         points, sensor = self.sets[id].read()
-        finite = np.isfinite(points).all(axis=1)
-        if not finite.any():
+        with np.errstate(over="ignore"):
+            here = (points - self.origin).astype(np.float32)
+        here = here[np.isfinite(here).all(axis=1)]
+        if not len(here):
             raise Reject("no_points", f"{id} holds no point")
-        here = (points[finite] - self.origin).astype(np.float32)
         return PointsRecord(id, here, None if sensor is None else (sensor - self.origin).astype(np.float32))
 
     def mesh(self) -> Mesh | None:
@@ -278,6 +279,7 @@ class FolderSource:
         tiles = [hash_file(path) for path in self.mesh_files]
         mesh = tiles if len(tiles) > 1 else tiles[0] if tiles else None
         told = {"units": self.inventory.units, "up": _plain(self.inventory.up), "points": self.inventory.points}
+        told |= {"origin": self.origin.tolist()} if self.origin.any() else {}
         return {"items": items, "mesh": mesh, "told": told}
 
     def _surface(self) -> np.ndarray:
@@ -311,13 +313,13 @@ class FolderSource:
 
 def _origin(poses: Sequence[np.ndarray | None]) -> np.ndarray:
     """(3,) float64: what is taken from all coordinates. 0 but for places on a map of the earth, millions of metres from its
-    origin: meshes and points are float32, which would round them to decimetres.
+    origin: meshes and points are float32, which would round them to decimetres. A few wild cameras decide nothing.
     """
     positions = np.array([pose[:3, 3] for pose in poses if pose is not None]).reshape(-1, 3)
     if not len(positions):  # of photos that were not placed yet
         return np.zeros(3)
-    away, wide = np.abs(positions).max(), np.ptp(positions, axis=0).max()
-    return positions.mean(axis=0).round() if away > max(FAR_AWAY, 1000 * wide) else np.zeros(3)
+    low, middle, high = np.quantile(positions, (0.1, 0.5, 0.9), axis=0)
+    return middle.round() if np.abs(middle).max() > max(FAR_AWAY, 10 * (high - low).max()) else np.zeros(3)
 
 
 def _plain(value: Any) -> Any:

@@ -90,10 +90,12 @@ def follow(camera: Camera, before: Sequence[Camera], after: Sequence[Camera]) ->
     """``camera`` with the motion of the two nearest cameras of ``before``, which went to ``after``; the nearer weighs more.
 
     Errors of poses change slowly along a drive, so a camera whose photo nobody looks at shares those of its neighbours. Motions
-    are along a camera's own axes, so cameras that look alike are asked, where there are any: not those of the next, opposite
-    line of a flight, or of another camera of a car.
+    are along a camera's own axes, so cameras that look alike are asked: not those of the next, opposite line of a flight, or of
+    another camera of a car. Where none looks alike the camera stays.
     """
-    alike = [number for number, other in enumerate(before) if _turn(camera, other) < ALIKE] or list(range(len(before)))
+    alike = [number for number, other in enumerate(before) if _turn(camera, other) < ALIKE]
+    if not alike:
+        return camera
     near = [alike[number] for number in nearest([before[number] for number in alike], camera.position, FOLLOWED)]
     away = np.array([np.linalg.norm(before[number].position - camera.position) for number in near])
     weights = 1 / np.maximum(away, 1e-3 * max(away.max(), 1e-9))
