@@ -168,11 +168,12 @@ def fit(
     outputs.state.mkdir(parents=True, exist_ok=True)
     centre = surroundings.sky_centre
     pixels = Pixels(views, centre, config.patch, torch.device(device))
+    validation = [view for view in validation if view.counts.any()]  # of one that a mask hides nothing is to be said
     held_out = Pixels(validation, centre, 1, torch.device(device)) if validation else None
     scene = Scene(config, surroundings, pixels)
     trainer = Trainer(scene)
     touched = {name: maps.count for name, maps in scene.maps.items()}
-    met = sum(int((view.hit & view.counts).sum()) for view in views) / max(sum(int(view.counts.sum()) for view in views), 1)
+    met = int((pixels.hit & pixels.counts).sum()) / max(int(pixels.counts.sum()), 1)
     outputs.say(
         f"{len(views)} views, {len(pixels.uv):,} pixels, {met:.0%} of them on the mesh, touch {touched['mesh']:,} texels, and "
         f"{touched['sky']:,} of the sky"
@@ -208,19 +209,11 @@ def fit(
 def validate(
     scene: Scene, pixels: Pixels, views: Sequence[View], step: int, outputs: Outputs, log: TrainingLog | None = None
 ) -> dict[str, float]:
-    """Mean PSNR over the validation views, of the pixels that count; shown, and logged where there is a ``log``. Nothing where
-    masks leave none.
-    """
+    """Mean PSNR over the validation views, of the pixels that count; shown, and logged where there is a ``log``."""
     rendered = scene.render(pixels)
-    errors = [
-        np.square(image - view.rgb / 255.0)[view.counts].mean()
-        for image, view in zip(rendered, views, strict=True)
-        if view.counts.any()
-    ]
-    if not errors:
-        return {}
+    errors = [np.square(image - view.rgb / 255.0)[view.counts].mean() for image, view in zip(rendered, views, strict=True)]
     psnr = float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
-    outputs.say(f"step {step}/{scene.config.steps}  validation: psnr {psnr:5.2f} dB over {len(errors)} views")
+    outputs.say(f"step {step}/{scene.config.steps}  validation: psnr {psnr:5.2f} dB over {len(views)} views")
     picture = None if outputs.show is None else outputs.show(step, [view.rgb for view in views], rendered)
     if log is not None:
         log.row({"step": step, "validation_psnr": round(psnr, 4)})

@@ -7,6 +7,7 @@ is rejected.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import subprocess
@@ -51,11 +52,9 @@ def read(config: Any, root: Path, prepared: Path | None = None) -> Inventory:
     def fill(shot: Shot) -> None:
         if where is not None:
             shot.image = file_in(where, shot.name, "image")
-            width, height = size_of(shot.image)
-            if width * height > config.max_pixels:
-                raise Reject("too_large", f"{width} x {height} pixels are over capture.max_pixels={config.max_pixels}")
         if folder is not None:
             if shot.name not in placed:
+                size_of(shot.image, config.max_pixels)  # why pycolmap was not asked, if it was not
                 raise Reject("no_pose", "pycolmap could not place it among the others: blurred, or without overlap")
             image = placed[shot.name]
             shot.lens, shot.camera_to_world = lenses[image.camera], colmap.camera_to_world(image)
@@ -81,7 +80,10 @@ def prepare(config: Any, root: Path, folder: Path) -> None:
     if root.is_file():
         _cut(root, folder, names)
     images = folder if root.is_file() else root
-    sizes = _sizes(images, names, config.max_pixels)
+    sizes = {}
+    for name in names:
+        with contextlib.suppress(Reject):  # told when the frame is asked for
+            sizes[name] = size_of(images / name, config.max_pixels)
     if len(sizes) < FEWEST:
         raise UserError(
             f"of {len(names)} images {len(sizes)} can be read and have at most capture.max_pixels={config.max_pixels} pixels; "
@@ -131,19 +133,6 @@ def _names(config: Any, root: Path) -> list[str]:
             f"capture.path={str(root)!r} holds {len(names)} photos ({', '.join(PHOTOS)}), at least {FEWEST} are needed"
         )
     return names
-
-
-def _sizes(folder: Path, names: list[str], most: int) -> dict[str, tuple[int, int]]:
-    """Width and height of the images that can be read and have at most so many pixels; the others are rejected later."""
-    sizes = {}
-    for name in names:
-        try:
-            width, height = size_of(folder / name)
-        except Reject:
-            continue
-        if width * height <= most:
-            sizes[name] = (width, height)
-    return sizes
 
 
 def _cut(video: Path, folder: Path, names: list[str]) -> None:

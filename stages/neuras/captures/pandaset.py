@@ -36,13 +36,19 @@ Boxes = dict[int, list[Box]]  # of actors, by frame
 
 def read(config: Any, root: Path) -> Inventory:
     """The inventory of the cameras that ``config.cameras`` names. A sweep shares the moment of the frames of its number."""
-    boxes = _actors(root) if config.mask_actors else None
+    boxes = _actors(root) if config.mask_actors else {}
     shots = [shot for camera in config.cameras for shot in _shots(root, camera, boxes)]
-    sweeps = _sweeps(root, boxes or {})
+    unseen = [shot.moment for shot in shots if shot.moment not in boxes] if config.mask_actors else []
+    if unseen:
+        raise UserError(
+            f"{str(root)!r} has no annotations/cuboids/{unseen[0]:02d}.pkl.gz, so what moves in that frame cannot be masked: "
+            "unpack the annotations too; capture.mask_actors=false does without"
+        )
+    sweeps = _sweeps(root, boxes)
     return Inventory(shots, sweeps, "lidar" if sweeps else "none", "metre", "PandaSet is in metres", (0.0, 0.0, 1.0))
 
 
-def _shots(root: Path, camera: str, boxes: Boxes | None) -> list[Shot]:
+def _shots(root: Path, camera: str, boxes: Boxes) -> list[Shot]:
     folder = root / "camera" / camera
     if "/" in camera or camera.startswith(".") or not folder.is_dir():
         known = sorted(path.name for path in (root / "camera").glob("*") if path.is_dir())
@@ -53,12 +59,7 @@ def _shots(root: Path, camera: str, boxes: Boxes | None) -> list[Shot]:
         raise UserError(f"{folder}: timestamps.json must hold one number for each of the {len(placed)} poses")
     shots = []
     for index, (pose, time) in enumerate(zip(placed, times, strict=True)):
-        if boxes is not None and index not in boxes:
-            raise UserError(
-                f"{str(root)!r} has no annotations/cuboids/{index:02d}.pkl.gz, so what moves in that frame cannot be masked: "
-                "unpack the annotations too; capture.mask_actors=false does without"
-            )
-        fill = partial(_fill, root, pose, intrinsics, (boxes or {}).get(index, []))
+        fill = partial(_fill, root, pose, intrinsics, boxes.get(index, []))
         shot = shot_of(f"camera/{camera}/{index:02d}.jpg", fill)
         shot.moment, shot.time, shot.meta = index, float(time), {"camera": camera}
         shots.append(shot)

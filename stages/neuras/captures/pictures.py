@@ -101,13 +101,21 @@ def _other_size(size: tuple[int, int], lens: Lens) -> str:
     return f"{said}: multiply the focal lengths, the principal point and the size in the set's file by {across:.4g}"
 
 
-def size_of(path: Path) -> tuple[int, int]:
-    """(width, height) that the image file states; raises Reject."""
+def size_of(path: Path, max_pixels: int | None = None) -> tuple[int, int]:
+    """(width, height) that the image file states; raises Reject, also where that is over ``max_pixels``."""
     try:
         with Image.open(path) as image:
-            return image.size
+            size = image.size
     except Exception as error:  # decoders of strangers' files fail in every way
         raise Reject("unreadable", f"the image {path.name}: {type(error).__name__}: {str(error)[:150]}") from None
+    if max_pixels is not None:
+        _check_size(size, "image", max_pixels)
+    return size
+
+
+def _check_size(size: tuple[int, int], what: str, max_pixels: int) -> None:
+    if size[0] * size[1] > max_pixels:
+        raise Reject("too_large", f"the {what} has {_times(size)} pixels, over capture.max_pixels={max_pixels}")
 
 
 def _fitting(size: tuple[int, int], max_side: int | None) -> tuple[int, int]:
@@ -122,8 +130,7 @@ def _opened(path: Path, max_pixels: int, what: str) -> Image.Image:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(path)
-            if image.width * image.height > max_pixels:
-                raise Reject("too_large", f"the {what} has {_times(image.size)} pixels, over capture.max_pixels={max_pixels}")
+            _check_size(image.size, what, max_pixels)
             image.load()
     except Reject:
         raise
