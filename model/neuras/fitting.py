@@ -62,6 +62,15 @@ class Trainer:
         """One step of everything. InputError where the loss is not finite: nothing was changed then."""
         scene, config = self.scene, self.config
         quantizing = bool(scene.codes) and self.step >= config.quantize_from * config.steps
+        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + self.step)
+        directions = batch.directions
+        if config.direction_noise:
+            noise = torch.randn(directions.shape, generator=generator).to(scene.device) * config.direction_noise
+            directions = torch.nn.functional.normalize(directions + noise, dim=1)
+        if scene.wider:
+            shares = [1 - config.coarser_share, *[config.coarser_share / scene.wider] * scene.wider]
+            levels = torch.multinomial(torch.tensor(shares), len(batch.detail), replacement=True, generator=generator)
+            batch = batch.coarser(levels.to(scene.device))
         leaves, samples, vq = {}, {}, torch.zeros((), device=scene.device)
         for name, (texels, weights, rays) in scene.places(batch).items():
             rows, where = scene.maps[name].row_of[texels].unique(return_inverse=True)
@@ -73,11 +82,6 @@ class Trainer:
                 used, loss = straight_through(leaf, scene.codes[name], config.commitment)
                 vq = vq + loss
             samples[name] = (gather(used, where, weights), rays)
-        directions = batch.directions
-        if config.direction_noise:
-            generator = torch.Generator().manual_seed(config.seed * 1_000_003 + self.step)
-            noise = torch.randn(directions.shape, generator=generator).to(scene.device) * config.direction_noise
-            directions = torch.nn.functional.normalize(directions + noise, dim=1)
         with torch.autocast(scene.device.type, torch.bfloat16, enabled=config.mixed_precision):
             rendered = scene.shade(batch, samples, directions)
         if scene.exposure is not None:

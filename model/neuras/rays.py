@@ -7,7 +7,7 @@ as many rows, and differences between neighbours can be compared.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -53,6 +53,10 @@ class Batch:
     rgb: Tensor
     views: Tensor
     patch: int
+
+    def coarser(self, levels: Tensor) -> Batch:
+        """The same pixels, as if each covered 2**levels as many texels along either side; levels: (B,) int64."""
+        return replace(self, spread=self.spread * (2.0**levels)[:, None], detail=self.detail + levels)
 
 
 def _open(hit: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,6 +55,7 @@ class FitConfig:
     rays: int = 1  # along a pixel's side when the finished scene is drawn; fitting casts one a pixel
     near_opacity: float = 0.12  # of all skyboxes but the farthest, at the start: far layers explain first
     direction_noise: float = 0.0  # sigma added to the view direction
+    coarser_share: float = 0.0  # of the pixels that read coarser levels of the mesh's texture than they ask for
     exposure: bool = False  # an affine change of colour per training image
     # Runtime: these do not change the result, or only its rounding
     compile: bool = False
@@ -89,6 +91,7 @@ class Scene:
         self.config, self.surroundings = config, surroundings
         self.pyramid = surroundings.pyramid
         self.layers = len(surroundings.sky_half_sizes)
+        self.wider = self.pyramid.levels - 1 if config.coarser_share else 0  # levels that a pixel may look coarser by
         self.device = pixels.uv.device
         self.half = torch.from_numpy(surroundings.sky_half_sizes.astype(np.float32)).to(self.device)
         generator = torch.Generator().manual_seed(config.seed)
@@ -114,7 +117,7 @@ class Scene:
         totals = {"mesh": math.prod(self.pyramid.sheet), "sky": self.layers * 6 * side * side}
         sums = {name: torch.zeros(total, 4, device=self.device) for name, total in totals.items()}
         lending = {"mesh": torch.ones(totals["mesh"], dtype=torch.bool), "sky": torch.zeros(totals["sky"], dtype=torch.bool)}
-        for batch in pixels.everything(CHUNK):
+        for batch in self._wider(pixels):
             for name, (texels, weights, rays) in self.places(batch).items():
                 used = weights + 1e-6  # a texel of weight 0 is named too
                 colours = torch.cat([batch.rgb[rays], torch.ones(len(rays), 1, device=self.device)], dim=1)
@@ -149,6 +152,14 @@ class Scene:
                 start[:, shading.OPACITY] = torch.where(farthest, 4.0, near)
             maps[name] = Maps(touched.cpu().numpy(), lending[name].numpy(), *cells[name], start)
         return maps
+
+    def _wider(self, pixels: Pixels) -> Iterator[Batch]:
+        """All pixels, and those that see the mesh once more for each level that fitting may look coarser by."""
+        for batch in pixels.everything(CHUNK):
+            yield batch
+            on_mesh = dataclasses.replace(batch, counts=batch.counts & batch.hit)
+            for levels in range(1, self.wider + 1):
+                yield on_mesh.coarser(torch.full_like(batch.views, levels))
 
     def _voxels(self, edge: float) -> np.ndarray:
         """(T,) int64: cells of the mesh's texels; those that no sample reaches are all in cell 0."""

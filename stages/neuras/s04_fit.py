@@ -70,6 +70,7 @@ class FitStageConfig(StageConfig):
     block: int = Field(4, ge=2)  # texels along the finest cell of a skybox
     near_opacity: float = Field(0.12, gt=0, lt=1)  # of all skyboxes but the farthest, at the start
     direction_noise: float = Field(0.0, ge=0)  # sigma added to the view direction
+    coarser_share: float = Field(0.15, ge=0, lt=1)  # of the pixels that read coarser levels than they ask for
     exposure: bool = added(False, legacy=False)  # an affine change of colour per training image
     # Runtime
     device: str = runtime("auto")  # auto | cpu | cuda
@@ -116,7 +117,7 @@ class FitStageConfig(StageConfig):
 
 class Fit(RunStage):
     name: ClassVar[str] = "fit"
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     inputs: ClassVar[dict[str, str]] = {"capture": "capture", "scaffold": "refine", "atlas": "atlas"}
     Config: ClassVar[Any] = FitStageConfig
 

@@ -52,8 +52,9 @@ def test_rows_differ_in_what_they_say_alone(jobs):
     for table in ("table1", "limits"):
         assert [row for row, job in jobs[table].items() if job.plan["refine"].config.surfels] == ["extended"]
     assert differ("limits", "fit") == {
-        "texture_levels": [3] * 4 + [1, 3, 3, 3], "near_opacity": [0.12] * 5 + [0.5, 0.12, 0.12],
-        "skyboxes": [6] * 6 + [1, 6], "sky_near_m": [150.0] * 6 + [2400.0, 150.0], "direction_noise": [0.0] * 7 + [0.08]
+        "texture_levels": [3] * 4 + [1] + [3] * 4, "coarser_share": [0.15] * 5 + [0.0] + [0.15] * 3,
+        "near_opacity": [0.12] * 6 + [0.5, 0.12, 0.12], "skyboxes": [6] * 7 + [1, 6],
+        "sky_near_m": [150.0] * 7 + [2400.0, 150.0], "direction_noise": [0.0] * 8 + [0.08]
     }  # fmt: skip
     assert differ("table3", "fit") == {
         "layers": [3, 3, 0], "channels": [12, 12, 4], "view_direction": [True, False, True]

@@ -181,6 +181,7 @@ TABLES = (
             Row("the same, with surfels that photos see through", "all_surfels"),
             Row("vertices that move until photos agree", "vertices"),
             Row("one texture level", "one_level"),
+            Row("pixels that read the levels they ask for, no others", "exact_levels"),
             Row("near skyboxes begin half opaque", "near_opacity"),
             Row("one skybox, the farthest", "one_skybox"),
             Row("noise on the view direction", "direction_noise"),

@@ -270,6 +270,7 @@ CONFIG = FitConfig(
     voxel=0.5,
     block=2,
     sky_side=16,
+    coarser_share=0.15,
     checkpoint_every=20,
     validate_every=40,
     log_every=10,
@@ -355,6 +356,7 @@ def test_another_configurations_state_is_refused(tmp_path):
         {"codes": 0},
         {"shader": shading.ShaderConfig(layers=0, channels=4)},
         {"direction_noise": 0.08},
+        {"coarser_share": 0.0},
         {"perceptual": 0.02},
         {"shared_levels": 0},
         {"quantize_from": 0.5},
@@ -366,10 +368,30 @@ def test_every_variant_learns_and_survives_its_files(tmp_path, change):
     other = run(tmp_path / "plain")[0]
     seen = view(0.07)
     assert psnr(baked, seen) > 22
-    assert not np.array_equal(baked.sky_opacity[0], other.sky_opacity[0])
+    assert not np.array_equal(rendered(baked, seen)[0], rendered(other, seen)[0])
     baked.save(tmp_path / "saved")
     assert psnr(Baked.load(tmp_path / "saved"), seen) == psnr(baked, seen)
     assert Baked.load(tmp_path / "saved").quantized == ("codes" not in change)
+
+
+def test_levels_that_training_pixels_only_mix_are_learned_one_by_one(tmp_path):
+    """A picture of half the size reads them alone."""
+
+    def widened(x: float, detail: float) -> View:
+        seen = view(x)
+        return dataclasses.replace(seen, detail=seen.detail + np.float32(detail))
+
+    found = {}
+    for share in (0.0, 0.15):
+        views = [widened(x, 0.4) for x in np.linspace(-1.5, 1.5, 12)]
+        baked = run(tmp_path / str(share), dataclasses.replace(CONFIG, coarser_share=share), views)[0]
+        for size, detail in (("fitted", 0.4), ("half", 1.4)):
+            seen = widened(0.07, detail)
+            rgb, _ = rendered(baked, seen)
+            error = np.square(rgb.reshape(32, 32, 3) - seen.rgb / 255)[seen.hit].mean()
+            found[size, share] = -10 * np.log10(error)
+    assert found["half", 0.15] > found["half", 0.0] + 2
+    assert found["fitted", 0.15] > found["fitted", 0.0] - 1
 
 
 def test_masked_pixels_teach_nothing(tmp_path):
