@@ -136,12 +136,14 @@ class Trainer:
         if not (folder / STATE).is_file():
             return False
         parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-        for parameter in parameters:  # as after a first step, which makes them
-            zeros = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
-            self.optimizer.state[parameter] = {"step": torch.tensor(0.0)} | zeros
         with safe_open(folder / STATE, "pt") as saved:
             if (saved.metadata() or {}).get("config") != json.dumps(self.config.identity(), sort_keys=True):
                 raise InputError(f"{folder / STATE} belongs to a run of another configuration: give it another folder")
+            known = set(saved.keys())
+            for number, parameter in enumerate(parameters):  # Adam makes the state of one that has had a gradient
+                if f"optimizer.{number}.step" in known:
+                    zeros = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+                    self.optimizer.state[parameter] = {"step": torch.tensor(0.0)} | zeros
             for name, value in self.tensors().items():
                 value.copy_(saved.get_tensor(name))
             self.step = int(saved.get_tensor("step"))

@@ -52,6 +52,11 @@ class Camera:
         return self.camera_to_world[:3, 3]
 
     @property
+    def forward(self) -> np.ndarray:
+        """(3,) float64, a unit vector along the optical axis."""
+        return -self.camera_to_world[:3, 2]
+
+    @property
     def world_to_camera(self) -> np.ndarray:
         """(4, 4) float64."""
         rotation = self.camera_to_world[:3, :3].T

@@ -11,6 +11,7 @@ A capture's artifact holds *frame* records ("frame-..") and *points* records ("p
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -135,6 +136,11 @@ class CaptureInfo:
     @classmethod
     def of(cls, capture: Artifact) -> CaptureInfo:
         return cls(**unpack_json(capture.file("capture.json").read_bytes()))
+
+
+def natural(name: str) -> list[tuple[bool, int, str]]:
+    """A key by which names sort as people count: 2.png before 10.png."""
+    return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def frames(capture: Artifact, *splits: Split) -> Iterator[FrameRecord]:

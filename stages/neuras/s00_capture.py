@@ -175,6 +175,8 @@ class Capture(MapStage):
         shown = [FrameRecord.from_record(draft.read(views[index].id)) for index in sheet.chosen(len(views))]
         (draft.files / "contact.png").write_bytes(sheet.drawn(views, shown, place))
         draft.note("summary", sheet.summary(views, place))
+        for note in source.inventory.notes if isinstance(source, FolderSource) else ():
+            draft.log(note)
         training = [view for view in views if view.split == "train"]
         if training and isinstance(source, FolderSource):
             sanity.check(training, place.surface(), lambda id: FrameRecord.from_record(draft.read(id)))

@@ -49,7 +49,7 @@ class Refine(MapStage):
     """A map stage of one item, so that the limits on time and memory hold for it."""
 
     name: ClassVar[str] = "refine"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     inputs: ClassVar[tuple[str, ...]] = ("capture", "scaffold")
     Config: ClassVar[Any] = RefineConfig
     limits: ClassVar[dict[str, float]] = {"cpu_s": 7200.0, "wall_s": 14400.0, "memory_gb": 20.0}

@@ -38,7 +38,7 @@ class BakeConfig(StageConfig):
 
 class Bake(RunStage):
     name: ClassVar[str] = "bake"
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas", "fit")
     Config: ClassVar[Any] = BakeConfig
     headline: ClassVar[str | None] = "site/index.html"
@@ -55,19 +55,20 @@ class Bake(RunStage):
         from stages.neuras.baking.residuals import ANGLES, Residuals
         from stages.neuras.baking.tiles import Tiling, cut
         from stages.neuras.evaluation.renderers import Reference
-        from stages.neuras.records import CaptureInfo, fitted_poses, frames, load_atlas, posed
+        from stages.neuras.records import CaptureInfo, fitted_poses, frames, load_atlas, natural, posed
 
         capture = inputs["capture"]
         baked = Baked.load(inputs["fit"].path / "files")
         atlas = load_atlas(inputs["atlas"].file("atlas.npz"))
-        largest = max(atlas.width, atlas.height)
-        if config.tile_m is None and largest > config.largest:
+        height, width = baked.mesh_size
+        if config.tile_m is None and max(width, height) > config.largest:
+            levels = f", all {baked.levels} levels in one," if baked.levels > 1 else ""
             raise UserError(
-                f"the texture is {atlas.width} x {atlas.height} texels, and bake.largest={config.largest}: lower atlas.size or "
-                "atlas.max_megatexels, or raise bake.largest for devices that take more"
+                f"the texture{levels} is {width} x {height} texels, and bake.largest={config.largest}: lower atlas.size or "
+                "atlas.max_megatexels, cut the scene in tiles (bake.tile_m=50), or raise bake.largest if devices take more"
             )
         info = CaptureInfo.of(capture)
-        views = list(posed(frames(capture), fitted_poses(inputs["fit"])))
+        views = sorted(posed(frames(capture), fitted_poses(inputs["fit"])), key=lambda view: natural(view.id))
         shown = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, config.frames).round().astype(int))]
         tiles = None
         if config.tile_m is not None:

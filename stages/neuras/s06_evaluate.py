@@ -47,7 +47,7 @@ class EvaluateConfig(StageConfig):
 
 class Evaluate(MapStage):
     name: ClassVar[str] = "evaluate"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     inputs: ClassVar[tuple[str, ...]] = ("capture", "atlas", "fit", "bake")
     Config: ClassVar[Any] = EvaluateConfig
     headline: ClassVar[str | None] = "report.html"

@@ -15,7 +15,7 @@ from model.neuras.baked import Baked
 from pipeline.errors import UserError
 from stages.graphics.browser import find_browser
 from stages.graphics.cameras import Camera
-from stages.neuras.baking import browser, drawing, shaders
+from stages.neuras.baking import browser, drawing, shaders, site
 from stages.neuras.baking.site import PAGE, write_site
 from stages.neuras.evaluation.renderers import Reference
 from stages.neuras.records import AtlasMesh, CaptureInfo, FrameRecord
@@ -215,3 +215,22 @@ def test_a_site_says_what_it_holds(tmp_path):
 def test_opened_as_a_file_the_page_says_why_it_shows_nothing():
     page = (PAGE / "index.html").read_text()
     assert 'location.protocol === "file:"' in page and "http.server --bind 127.0.0.1" in page
+
+
+def test_photos_on_the_page_say_nothing_of_where_they_were_taken_and_are_not_turned():
+    rng = np.random.default_rng(0)
+    image = Image.fromarray(rng.integers(0, 255, (24, 40, 3), np.uint8))
+    exif = image.getexif()
+    exif[0x0112] = 6  # turned by 90 degrees
+    exif[0x010E] = "at home"
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", exif=exif, comment=b"my garden", icc_profile=b"a profile")
+    told = buffer.getvalue()
+    bare = site.without_metadata(told)
+    assert b"at home" in told and b"my garden" in told
+    assert b"at home" not in bare and b"my garden" not in bare and b"a profile" in bare
+    again = Image.open(io.BytesIO(bare))
+    assert not again.getexif() and np.array_equal(np.array(again), np.array(Image.open(io.BytesIO(told))))
+    assert site.without_metadata(bare) == bare
+    assert site.without_metadata(told[:2] + b"\xff" + told[2:]) in (bare, bare[:2] + b"\xff" + bare[2:])
+    assert site.without_metadata(b"\x89PNG") is None and site.without_metadata(told[:40]) is None

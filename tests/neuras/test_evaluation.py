@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 from scipy import linalg
+from scipy.spatial.transform import Rotation
 
 from pipeline.errors import UserError
 from pipeline.run import run_pipeline
@@ -18,11 +21,12 @@ from stages import cli
 from stages.graphics import metrics
 from stages.graphics.arrays import unpack_json
 from stages.graphics.browser import find_browser
+from stages.graphics.cameras import Camera
 from stages.neuras.baking import drawing
-from stages.neuras.evaluation import distributions, drive, paths, report, scores, summary
+from stages.neuras.evaluation import costs, distributions, drive, paths, report, scores, summary
 from stages.neuras.evaluation.renderers import as_bytes, opengl
 from stages.neuras.evaluation.warping import Warping
-from stages.neuras.rasterizing.photos import Source
+from stages.neuras.rasterizing.photos import Source, beside, nearest
 from stages.neuras.records import FrameRecord
 from tests.model import inception, lpips
 from tests.neuras import line, scenes
@@ -124,6 +128,13 @@ def test_agreement_is_in_steps_of_eight_bits():
 
 
 # -- warping
+
+
+def test_a_frame_is_timed_once_its_residuals_are_there():
+    drawn = []
+    counter = SimpleNamespace(draw=drawn.append, finish=lambda: None)
+    assert len(costs.frame_times(counter, [1, 2, 3])) == 3
+    assert drawn == [1, 1, 2, 2, 3, 3]  # the first time files are read
 
 
 def test_warping_shows_a_photo_at_its_own_place_and_reads_the_nearest_alone():
@@ -405,7 +416,9 @@ def test_runs_stand_side_by_side(run, capsys):
     means, gain = row.split("|")[2:4], row.split("|")[5]
     assert float(gain.split()[0]) == pytest.approx(float(means[0]) - float(means[1]), abs=0.011) and float(gain.split()[0]) > 10
     assert table[-1].startswith("| stored (MB) |")
-    for wrong, said in ((other.key, "not of the same frames"), ("ball/bake", "no evaluation")):
+    halved = run(evaluate={**quick, "exposure": "half"})[0]["evaluate"]
+    cases = ((other.key, "not of the same frames"), ("ball/bake", "no evaluation"), (halved.key, "evaluate.exposure=half"))
+    for wrong, said in cases:
         assert lightmill("scores", good.key, wrong, "--store", store) != 0
         assert said in capsys.readouterr().err
 
@@ -517,3 +530,25 @@ def test_frames_of_a_drive_are_in_order_of_time():
     late, early = (FrameRecord(id, cameras[i], b"", "train", time=time) for i, id, time in ((0, "a", 2.0), (1, "b", 1.0)))
     beside = FrameRecord("c", cameras[2], b"", "shift", time=0.0)
     assert paths.driven([late, early, beside]) == [cameras[1], cameras[0]]
+    unpadded = [FrameRecord(f"frame-{number}", cameras[i], b"", "train") for i, number in enumerate((10, 9, 100))]
+    assert paths.driven(unpadded) == [cameras[1], cameras[0], cameras[2]]
+
+
+def test_a_drive_of_several_cameras_is_that_of_the_one_that_looks_ahead():
+    def camera(x: float, angle: float) -> Camera:
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("z", angle, degrees=True).as_matrix() @ np.array([[0, 0, -1], [-1, 0, 0], [0, 1, 0]])
+        pose[:3, 3] = x, 0, 0
+        return replace(scenes.looking_at((5.0, 0.0, 0.0)), camera_to_world=pose)
+
+    ahead, left = ([camera(float(x), angle) for x in range(3)] for angle in (0, 90))
+    assert np.allclose(ahead[0].forward, (1, 0, 0)) and np.allclose(left[0].forward, (0, 1, 0))
+    frames = [
+        FrameRecord(f"frame-{name}-{number}", one, b"", "train", time=float(number), meta={"camera": name})
+        for name, along in (("a-left", left), ("front", ahead))
+        for number, one in enumerate(along)
+    ]
+    assert paths.driven(frames) == ahead
+    both = [*left, *ahead]
+    assert nearest(both, ahead[1], 4) == [4, 3, 5, 1]  # however near the others are
+    assert beside(both, 4, 2) == [3, 5]

@@ -37,7 +37,10 @@ def registered(tmp_path, monkeypatch):
 
     def program(command, **_):
         job = json.loads(Path(command[-1]).read_text())
-        jobs.append(job)
+        pictures = {name: Image.open(Path(job["images"]) / name) for name in job["names"]}
+        seen = {name: (picture.size, picture.getexif().get(images.ORIENTATION, 1)) for name, picture in pictures.items()}
+        masks = {path.name: np.array(Image.open(path)) for path in Path(job["masks"] or "none").glob("*")}
+        jobs.append(job | {"seen": seen, "masks": masks})
         shutil.copytree(made / "sparse", Path(job["folder"]) / "sparse", dirs_exist_ok=True)
         return subprocess.CompletedProcess(command, 0, "", "")
 
@@ -68,6 +71,60 @@ def test_files_that_are_no_photos_spare_the_others(tmp_path, registered):
     rejects = artifact.manifest["outputs"]["rejects"]
     assert len(list(frames(artifact))) == 6 and rejects == {"unreadable": 1, "too_large": 1}
     assert len(jobs[0]["names"]) == 6 and jobs[0]["one_camera"]
+
+
+def test_photos_that_lie_on_their_side_are_turned_first(tmp_path, registered):
+    """As a phone stores them that was held upright: the sensor's rows, and a word of EXIF."""
+    photos, jobs = registered
+    upright = np.array(Image.open(photos / "02.png"))
+    lying = Image.fromarray(np.rot90(upright))
+    exif = lying.getexif()
+    exif[images.ORIENTATION] = 6  # to be turned clockwise
+    lying.save(photos / "02.png", exif=exif)
+    artifact = run(photos, tmp_path / "store")
+    frame = next(frame for frame in frames(artifact) if frame.meta["file"] == "02.png")
+    assert np.abs(dot_of(frame) - frame.camera.project(POINT)[0]).max() < 0.12 and frame.meta["orientation"] == 6
+    assert len(jobs[0]["names"]) == 6 and jobs[0]["one_camera"] and not jobs[0]["masks"]
+    assert set(jobs[0]["seen"].values()) == {(upright.shape[1::-1], 1)}
+    assert all("orientation" not in frame.meta for frame in frames(artifact) if frame.meta["file"] != "02.png")
+
+
+@pytest.mark.parametrize("named", ["00.png.png", "00.png"])
+def test_masks_beside_the_photos_are_taken(tmp_path, registered, named):
+    photos, jobs = registered
+    mask = np.full(np.array(Image.open(photos / "00.png")).shape[:2], 255, np.uint8)
+    mask[:9] = 0
+    (photos / "masks").mkdir()
+    Image.fromarray(mask).save(photos / "masks" / named)
+    artifact = run(photos, tmp_path / "store")
+    found = {frame.meta["file"]: frame.counts() for frame in frames(artifact)}
+    assert len(found) == 6 and not found["00.png"][:8].any()
+    assert np.array_equal(found["00.png"][40:], found["01.png"][40:]) and found["01.png"][:8].any()
+    assert list(jobs[0]["masks"]) == ["00.png.png"] and np.array_equal(jobs[0]["masks"]["00.png.png"], mask)
+    shutil.move(photos / "masks", photos.parent / "masks")  # a model of COLMAP has them beside its images
+    by_colmap = next(frames(run(photos.parent, tmp_path / "store", name="colmap")))
+    assert np.array_equal(by_colmap.counts(), found["00.png"])
+
+
+def test_photos_of_other_kinds_are_told(tmp_path, registered):
+    photos, _ = registered
+    for name in ("a.HEIC", "b.heic", "c.webp"):
+        (photos / name).write_bytes(b"what a phone wrote")
+    config = parse(Capture.Config, {"name": "images", "path": str(photos)}, "capture")
+    assert images.read(config, photos).notes == [
+        "photos of other kinds were left out (2 .heic, 1 .webp): save them as JPEG or PNG"
+    ]
+    for path in photos.glob("*.png"):
+        path.unlink()
+    with pytest.raises(UserError, match="holds 0 photos.*2 .heic"):
+        run(photos, tmp_path / "store")
+
+
+def test_photos_are_taken_in_the_order_that_people_count_in(tmp_path):
+    for number in (1, 2, 10, 9, 100):
+        Image.new("RGB", (8, 8)).save(tmp_path / f"IMG_{number}.png")
+    config = parse(Capture.Config, {"name": "images", "path": str(tmp_path)}, "capture")
+    assert [shot.name for shot in images.read(config, tmp_path).shots] == [f"IMG_{n}.png" for n in (1, 2, 9, 10, 100)]
 
 
 def test_every_photo_is_part_of_every_key(tmp_path, registered):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from pipeline.errors import UserError
 from stages.graphics.browser import find_browser
@@ -101,14 +102,26 @@ def test_a_view_depends_on_no_photo_that_is_masked_and_on_none_that_sees_somethi
 def test_no_photo_comes_or_goes_at_once(tmp_path):
     residuals = World(tmp_path, half).residuals
     path = np.linspace(np.add(PLACES[0], (0.1, 0.3, 0)), PLACES[-1], 2001)
+    turns = np.linspace(0, np.pi, len(path))  # meanwhile the view turns until it looks away
     before = None
-    for eye in path:
+    for eye, turn in zip(path, turns, strict=True):
+        look = Rotation.from_euler("z", turn).apply(moved(PLACES[0]).forward)
         weights = np.zeros(len(PLACES))
-        chosen, shares = residuals.chosen(eye)
+        chosen, shares = residuals.chosen(eye, look)
         weights[chosen] = shares
         assert weights.sum() == pytest.approx(1) and len(chosen) == 4
         assert before is None or np.abs(weights - before).max() < 0.05
         before = weights
+
+
+def test_photos_that_look_elsewhere_come_behind_those_that_look_alike(tmp_path):
+    residuals = World(tmp_path, half, nearest=2).residuals
+    camera = moved(PLACES[2])
+    eye = camera.position - np.array(CENTRE)
+    assert residuals.chosen(eye, camera.forward)[0] == [2, 3]
+    residuals.looks[[2, 3]] *= -1
+    assert residuals.chosen(eye, camera.forward)[0] == [1, 4]
+    assert residuals.chosen(eye, -camera.forward)[0] == [2, 3]
 
 
 def test_a_photo_alone_fades_where_it_weighs_little(tmp_path):
@@ -117,7 +130,7 @@ def test_a_photo_alone_fades_where_it_weighs_little(tmp_path):
     gains = []
     for share in (0.0, 0.5, 0.9, 1.0):
         camera = moved(tuple(np.add(PLACES[0], share * np.subtract(PLACES[1], PLACES[0]))))
-        chosen, weights = world.residuals.chosen(camera.position - np.array(CENTRE))
+        chosen, weights = world.residuals.chosen(camera.position - np.array(CENTRE), camera.forward)
         weight = dict(zip(chosen, weights, strict=True)).get(3, 0)
         added = np.abs(world.both.render(camera) - world.plain.render(camera)).mean()
         gains.append((weight, added))

@@ -82,11 +82,11 @@ def encoded(value: int) -> bytes:
     return buffer.getvalue()
 
 
-def made(key: str, better: float, vertices: int, photo: int = 10) -> tables.Made:
+def made(key: str, better: float, vertices: int, photo: int = 10, split: str = "test") -> tables.Made:
     """A row whose PSNR is ``better`` dB above others' in every frame, whatever the frame."""
     rng = np.random.default_rng(0)
     views = [
-        *(view(f"t{i}", 0.0, 20 + rng.normal(0, 4) + better, 25 + i, "test") for i in range(6)),
+        *(view(f"t{i}", 0.0, 20 + rng.normal(0, 4) + better, 25 + i, split) for i in range(6)),
         *(view(f"r{i}", 3.0, 18 + i + better, 17 + i) for i in range(4)),
     ]
     numbers = summary.summarise(views) | {
@@ -124,6 +124,7 @@ def written(tmp_path, monkeypatch, results: dict[str, tables.Made], table: str =
 def test_the_page_holds_ours_beside_the_published_and_what_differs(tmp_path, monkeypatch, capsys):
     results = {
         "table1/ours": made("a", 0.0, 40_000), "table1/plain": made("b", -0.5, 40_000), "table5/car": made("c", 3.0, 900),
+        "figure7/vertices_50k": made("f", 0.0, 50_000), "table3/no_mlp": made("g", -1.0, 40_000),
         "figure7/vertices_5k": made("d", -1.0, 5000), "figure7/whole": made("e", 1.0, 300_000, photo=11),
     }  # fmt: skip
     found = written(tmp_path, monkeypatch, results)
@@ -147,11 +148,12 @@ def test_the_page_holds_ours_beside_the_published_and_what_differs(tmp_path, mon
     assert ["texture", "8192 x 8192, one level, 12 channels", "64 x 32, 3 levels, 12 channels"] in table["differs"]
     assert found["figure7"]["the whole scaffold"]["gain"] is None  # its photos are others: no pair
     assert found["figure7"]["about 5,000 vertices"]["ours"]["vertices"] == {"mean": 5000}
+    assert not any("gain" in row for row in found["table3"].values())  # its first row is missing
     assert all("gain" not in row for label, row in found["table5"].items() if label != "differs")
     page = (tmp_path / "out" / "report.html").read_text()
     for text in ("25.45", "published", "UniSim", "llvmpipe", "7.7 times", "-0.50"):
         assert text in page, text
-    assert page.count("data:image/jpeg") == 4 + 2 + 3  # a photo and pictures of tables 1 and 5 and of figure 7
+    assert page.count("data:image/jpeg") == 4 + 2 + 4 + 2  # a photo and pictures of tables 1 and 5, of figure 7, of table 3
     words = (tmp_path / "out" / "report.md").read_text()
     assert "## Table 4: what quantization gives" in words and "data:image" not in words
     said = capsys.readouterr().out
@@ -171,6 +173,14 @@ def test_a_single_table_and_what_is_wrong_with_an_order(tmp_path, monkeypatch):
         tables.write(Order("table4", None, ["fit.codes=64"], tmp_path))
     with pytest.raises(UserError, match="one value"):
         tables.write(Order("table4", None, ["fit.steps=1,2"], tmp_path))
+
+
+def test_rows_without_test_views_have_pictures_of_others(tmp_path, monkeypatch):
+    """With evaluate.splits=[validation]."""
+    results = {f"table4/{row}": made(row, 0.0, 10, split="validation") for row in ("with_vq", "without_vq")}
+    found = written(tmp_path, monkeypatch, results, "table4", status=0)["table4"]
+    assert all(row["ours"]["psnr_3"]["mean"] > 0 for label, row in found.items() if label.startswith("with") and "ours" in row)
+    assert (tmp_path / "out" / "report.html").read_text().count("data:image/jpeg") == 3
 
 
 def test_a_row_of_residuals_that_nobody_made_is_a_dash(tmp_path, monkeypatch):

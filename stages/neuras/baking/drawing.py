@@ -121,7 +121,7 @@ class Drawing:
                 values = maps[..., 4 * index : 4 * index + 4]
                 part[..., : values.shape[-1]] = values
             else:
-                part = ranges.quantized(maps)[..., 4 * index : 4 * index + 4]
+                part = ranges.part(4 * index).quantized(maps[..., 4 * index : 4 * index + 4])
             data, kind = np.ascontiguousarray(part).tobytes(), "f2" if ranges is None else "f1"
             texture = (
                 self._gl.texture_array((width, height, count), 4, data, alignment=1, dtype=kind)
@@ -148,6 +148,10 @@ class Drawing:
     def _draw(self, camera: Camera, mode: str, skybox: int) -> None:
         size = (camera.width, camera.height)
         if self._target is None or self._target.size != size:
+            for old in (self._target, self._fine):
+                if old is not None:  # OpenGL's objects outlive Python's
+                    for part in (old, *old.color_attachments, old.depth_attachment):
+                        part.release()
             self._target, self._fine = (self._framebuffer(camera, rays) for rays in (1, self._rays))
         pose = camera.camera_to_world
         eye = pose[:3, 3] - self._centre
@@ -169,7 +173,7 @@ class Drawing:
                 texture.use(unit)
                 program[name] = unit
         if self._photos is not None:
-            self._photos.choose(eye)
+            self._photos.choose(eye, camera.forward)
             for program in (self._mesh, self._sky):
                 self._photos.use(program, len(self._textures))
         self._fine.use()
@@ -226,9 +230,9 @@ class _Photos:
         self._depths.filter = (gl.NEAREST, gl.NEAREST)
         self._uniforms: dict[str, bytes] = {}
 
-    def choose(self, eye: np.ndarray) -> None:
-        """The photos of a view from ``eye`` (3,), relative to the skyboxes' centre."""
-        chosen, weights = self._residuals.chosen(eye)
+    def choose(self, eye: np.ndarray, look: np.ndarray) -> None:
+        """The photos of a view from ``eye`` (3,), relative to the skyboxes' centre, along ``look`` (3,)."""
+        chosen, weights = self._residuals.chosen(eye, look)
         matrices, eyes, about = np.zeros((len(chosen), 4, 4)), np.zeros((len(chosen), 3)), np.zeros((len(chosen), 4))
         for index, (number, weight) in enumerate(zip(chosen, weights, strict=True)):
             source, layer = self._residuals.source(number), self._layer(number)

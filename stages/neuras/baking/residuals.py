@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import psutil
 from PIL import Image
 
 from model.neuras.exposure import matched
@@ -40,7 +41,9 @@ NEUTRAL = 128  # byte of no residual
 OPEN, MASKED = 0, 65535  # codes of depth: nothing hit, and a pixel that does not count
 LAYERS = 8  # photos on the device at a time, those that were wanted last
 CACHED = 16  # photos kept in memory
+BYTES = 1000  # that torch takes to draw a pixel
 ANGLES = (5.0, 10.0, 20.0, 40.0)  # degrees that are tried
+ALIKE, UNLIKE = np.cos(np.radians([45.0, 75.0]))  # of the angle between where a view and a photo look
 HARMLESS = 0.1  # dB that the angle that is taken may cost held-out frames
 JUDGED = 4  # held-out frames that are looked at, at most
 GLANCE = 64  # pixels of a frame's longer side that tell whether it sees the mesh
@@ -73,7 +76,8 @@ class Residuals:
 
     nearest: photos that a view takes. layers: photos on the device at a time. angle: radians at which a residual has faded to
     1/e. near, far: the distances of the first and the last code of depth. size: width and height of the largest picture.
-    off_mesh: distance of what rays beside the mesh see, by which alone their angles are told. eyes: (K, 3).
+    off_mesh: distance of what rays beside the mesh see, by which alone their angles are told; also what photos that look
+    elsewhere count as farther. eyes, looks: (K, 3), where photos were taken, and unit vectors along their optical axes.
     """
 
     def __init__(self, folder: Path, about: dict[str, Any]):
@@ -90,6 +94,7 @@ class Residuals:
         self.soft: float = about["soft"]
         self.off_mesh: float = about["off_mesh"]
         self.eyes = np.array([source["eye"] for source in self._sources], float).reshape(-1, 3)
+        self.looks = np.array([source["matrix"][2][:3] for source in self._sources], float).reshape(-1, 3)
         self.size = tuple(max(source[name] for source in self._sources) for name in ("width", "height"))
         self.source = functools.lru_cache(CACHED)(self._read)
 
@@ -122,7 +127,7 @@ class Residuals:
         (site / FOLDER).mkdir(parents=True, exist_ok=True)
         mixed = [frame for frame in frames if min(frame.camera.width, frame.camera.height) > 1]  # of one row nothing is
         write = functools.partial(_write, site / FOLDER, scene, centre, depth_range, exposure)
-        with ThreadPoolExecutor(os.cpu_count()) as threads:  # each photo by one of them, so the bytes are the same
+        with ThreadPoolExecutor(_threads(mixed)) as threads:  # each photo by one of them, so the bytes are the same
             sources = list(threads.map(write, mixed))
         near, far = depth_range
         about = {
@@ -167,18 +172,18 @@ class Residuals:
         """
         camera, photo, counts = frame.camera, frame.image(), frame.counts()
         view = scene.caster.view(camera)
-        plain, eye = scene.shade(camera, view), camera.position - centre
+        plain, eye, look = scene.shade(camera, view), camera.position - centre, camera.forward
         ways, depth = camera.directions().reshape(-1, 3), view.depth.ravel().astype(float)
         errors = []
         for angle in ANGLES:
-            added = self.at(eye, ways, depth, float(np.radians(angle)))
+            added = self.at(eye, look, ways, depth, float(np.radians(angle)))
             colours = np.clip(plain + added.reshape(plain.shape), 0, 1)
             picture = np.rint(255 * colours).astype(np.uint8)
             if exposure:
                 picture = matched(picture, photo, counts)
             errors.append(float(np.square((picture.astype(float) - photo)[counts] / 255).mean()))
         there = depth > 0
-        away = (eye + ways[there] * depth[there, None])[:, None] - self.eyes[self.chosen(eye)[0]]
+        away = (eye + ways[there] * depth[there, None])[:, None] - self.eyes[self.chosen(eye, look)[0]]
         cosines = np.einsum("nki,ni->nk", away, ways[there]) / np.maximum(np.linalg.norm(away, axis=2), 1e-12)
         nearest = np.arccos(np.clip(cosines.max(axis=1), -1, 1))
         return errors, float(np.degrees(np.median(nearest)))
@@ -199,19 +204,27 @@ class Residuals:
         width, height = self.size
         return 2 * 4 * width * height * self.layers
 
-    def chosen(self, eye: np.ndarray) -> tuple[list[int], np.ndarray]:
-        """Numbers of the photos that a view from ``eye`` (3,) takes, and their weights, which sum to 1.
+    def chosen(self, eye: np.ndarray, look: np.ndarray) -> tuple[list[int], np.ndarray]:
+        """Numbers of the photos that a view takes, and their weights, which sum to 1.
 
-        The nearer weighs more. A photo's weight has fallen to 0 where another one takes its place, so nothing jumps.
+        eye: (3,), where it is seen from. look: (3,), a unit vector along its optical axis.
+
+        The nearer weighs more. A photo that looks elsewhere, such as another camera's of the same car, counts as up to
+        ``off_mesh`` farther. A photo's weight has fallen to 0 where another one takes its place, so nothing jumps.
         """
-        distances = np.linalg.norm(self.eyes - eye, axis=1)
+        elsewhere = np.clip((ALIKE - self.looks @ look) / (ALIKE - UNLIKE), 0, 1)
+        distances = np.linalg.norm(self.eyes - eye, axis=1) + self.off_mesh * elsewhere
         order = np.argsort(distances, kind="stable")[: self.nearest + 1]
         closeness = 1 / (distances[order] + self.soft)
         weights = closeness[: self.nearest] - (closeness[self.nearest] if len(order) > self.nearest else 0)
         return order[: self.nearest].tolist(), weights / max(float(weights.sum()), 1e-30)
 
-    def at(self, eye: np.ndarray, ways: np.ndarray, depth: np.ndarray, angle: float | None = None) -> np.ndarray:
+    def at(
+        self, eye: np.ndarray, look: np.ndarray, ways: np.ndarray, depth: np.ndarray, angle: float | None = None
+    ) -> np.ndarray:
         """(N, 3) float64, to be added to the colours of rays from ``eye`` (3,) along unit ``ways`` (N, 3).
+
+        look: as of `chosen`.
 
         depth: (N,), the distance to the mesh, 0 where it is missed; such rays are taken to see something infinitely far.
         angle: radians, in place of the site's own.
@@ -227,7 +240,7 @@ class Residuals:
         far = np.where(hit, 1.0, 0.0)
         points = np.where(hit[:, None], eye + ways * depth[:, None], ways)
         total, weights = np.zeros((len(ways), 3)), np.zeros(len(ways))
-        for number, weight in zip(*self.chosen(eye), strict=True):
+        for number, weight in zip(*self.chosen(eye, look), strict=True):
             if weight <= 0:
                 continue
             source = self.source(number)
@@ -253,6 +266,13 @@ class Residuals:
     def distance(self, codes: np.ndarray) -> np.ndarray:
         """What codes of depth stand for."""
         return self.near * (self.far / self.near) ** ((codes.astype(float) - 1) / (MASKED - 2))
+
+
+def _threads(frames: Sequence[FrameRecord]) -> int:
+    """Photos that are drawn at a time: one for each core of ours, and no more than free memory holds."""
+    pixels = max((frame.camera.width * frame.camera.height for frame in frames), default=1)
+    fitting = psutil.virtual_memory().available // (2 * BYTES * pixels)
+    return int(max(1, min(len(os.sched_getaffinity(0)), fitting)))
 
 
 def _sees(caster: Caster, camera: Camera) -> bool:

@@ -77,6 +77,10 @@ class Ranges:
         low = _padded(flat.min(axis=0).astype(np.float32))
         return cls(low, _padded(flat.max(axis=0).astype(np.float32)) - low)
 
+    def part(self, first: int) -> Ranges:
+        """Of the four channels from ``first`` on."""
+        return Ranges(self.low[first : first + 4], self.span[first : first + 4])
+
     def quantized(self, features: np.ndarray) -> np.ndarray:
         """(.., 4 n) uint8 of (.., D) features."""
         channels = features.shape[-1]

@@ -42,6 +42,8 @@ from stages.neuras.baking.tiles import Tiles
 from stages.neuras.records import FRAME, AtlasMesh, CaptureInfo, FrameRecord
 
 PAGE = Path(__file__).parent / "page"
+SCAN, FILL = 0xDA, 0xFF  # of a JPEG: the marker before the picture's data, and a byte that may stand before any marker
+METADATA = (0xE1, 0xED, 0xFE)  # EXIF and XMP, IPTC, comments
 STREAMING = "tiles.js"  # the script of a page whose scene is cut; it starts the viewer and keeps its textures filled
 
 
@@ -219,6 +221,28 @@ def _codes(path: Path, codes: np.ndarray) -> None:
     Image.fromarray(pixels, "RGB").save(path, optimize=True)
 
 
+def without_metadata(jpeg: bytes) -> bytes | None:
+    """The JPEG without EXIF, XMP and comments, its picture as it was; None where the bytes are no JPEG.
+
+    A site is made to be shared, and a photo's metadata say where it was taken. Browsers also turn a picture as EXIF says, and
+    cameras here are those of the picture as it is stored.
+    """
+    if not jpeg.startswith(b"\xff\xd8"):
+        return None
+    kept, at = [jpeg[:2]], 2
+    while jpeg[at : at + 1] == b"\xff" and len(jpeg) >= at + 4:
+        marker, length = jpeg[at + 1], int.from_bytes(jpeg[at + 2 : at + 4], "big")
+        if marker == FILL:
+            at += 1
+            continue
+        if marker == SCAN:
+            return b"".join([*kept, jpeg[at:]])
+        if marker not in METADATA:
+            kept.append(jpeg[at : at + 2 + length])
+        at += 2 + length
+    return None
+
+
 def view_name(frame_id: str) -> str:
     """How the page calls the frame of that record."""
     return frame_id.removeprefix(FRAME)
@@ -228,8 +252,8 @@ def _view(folder: Path, frame: FrameRecord, centre: np.ndarray) -> dict[str, Any
     """A frame as the page knows it; its photo is written beside. World coordinates are relative to the centre."""
     name = view_name(frame.id)
     path = folder / "frames" / f"{name}.jpg"
-    if frame.picture.startswith(b"\xff\xd8"):
-        path.write_bytes(frame.picture)
+    if (bare := without_metadata(frame.picture)) is not None:
+        path.write_bytes(bare)
     else:
         buffer = io.BytesIO()
         Image.fromarray(frame.image()).save(buffer, "JPEG", quality=92)

@@ -7,7 +7,7 @@ fail in another way than by a UserError: every count is checked against the byte
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,8 @@ from pipeline.errors import Reject, UserError
 from stages.graphics.geometry.paths import inside
 from stages.neuras.captures import poses
 from stages.neuras.captures.lenses import Lens
-from stages.neuras.captures.sources import Inventory, PointSet, Shot, file_in, shot_of
+from stages.neuras.captures.sources import Inventory, PointSet, Shot, file_in, mask_of, shot_of
+from stages.neuras.records import natural
 
 # name, in the order of the binary format's numbers -> number of parameters; those that are read have a lens below
 MODELS = {
@@ -46,9 +47,9 @@ def read(config: Any, root: Path) -> Inventory:
     folder = model_folder(config.model, root)
     lenses = cameras(folder)
     shots = []
-    for image in sorted(images(folder), key=lambda image: image.name):
+    for image in sorted(images(folder), key=lambda image: natural(image.name)):
         named = f"{config.images}/{image.name}" if config.images else image.name
-        shot = shot_of(image.name, partial(_fill, image, lenses.get(image.camera), partial(file_in, root, named, "image")))
+        shot = shot_of(image.name, partial(_fill, image, lenses.get(image.camera), root, named))
         shot.moment = image.name
         shots.append(shot)
     found = _file(folder, "points3D")
@@ -56,12 +57,14 @@ def read(config: Any, root: Path) -> Inventory:
     return Inventory(shots, sets, "sfm" if sets else "none", units_from="COLMAP's models have no unit")
 
 
-def _fill(image: PosedImage, lens: Lens | None, find: Callable[[], Path], shot: Shot) -> None:
+def _fill(image: PosedImage, lens: Lens | None, root: Path, named: str, shot: Shot) -> None:
+    """named: the image's file below ``root``."""
     if lens is None:
         raise Reject("no_intrinsics", f"the model has no camera {image.camera}")
     if lens.wrong():
         raise Reject("no_intrinsics", lens.wrong())
-    shot.lens, shot.camera_to_world, shot.image = lens, camera_to_world(image), find()
+    shot.lens, shot.camera_to_world, shot.image = lens, camera_to_world(image), file_in(root, named, "image")
+    shot.mask = mask_of(root, image.name)
 
 
 def model_folder(model: str | None, root: Path) -> Path:

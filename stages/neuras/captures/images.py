@@ -12,24 +12,30 @@ import importlib.util
 import json
 import subprocess
 import sys
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 from pipeline.atomic import atomic_path
 from pipeline.errors import Reject, UserError
 from stages.graphics.geometry.paths import inside
 from stages.graphics.video import frame_count, read_video
 from stages.neuras.captures import colmap, registration
-from stages.neuras.captures.pictures import size_of
-from stages.neuras.captures.sources import FEWEST, Inventory, PointSet, Shot, file_in, shot_of
+from stages.neuras.captures.pictures import opened, size_of
+from stages.neuras.captures.sources import FEWEST, MASKS, Inventory, PointSet, Shot, file_in, mask_of, shot_of
+from stages.neuras.records import natural
 
 PHOTOS = (".jpg", ".jpeg", ".png")
+OTHERS = (".heic", ".heif", ".avif", ".webp", ".tif", ".tiff", ".bmp", ".dng")  # photos too, but not read
 VIDEOS = (".mp4", ".mov", ".m4v")
 CUT, MODEL, JOB = "images", "sparse/0", "job.json"  # below the prepared folder
-QUALITY = 95  # of the JPEGs that a video is cut into
+UPRIGHT, HIDDEN = "upright", "hidden"  # as well: what pycolmap reads where photos lie on their side, and masks as it names them
+ORIENTATION = 0x0112  # EXIF: how a photo is stored; 1 is upright
+QUALITY = 95  # of the JPEGs that are made here
 LONGEST_S = 24 * 3600  # of registration
 
 
@@ -44,14 +50,19 @@ def root_of(path: str | None) -> Path:
 def read(config: Any, root: Path, prepared: Path | None = None) -> Inventory:
     """The inventory of the images, with their poses if ``prepared`` is the folder that ``prepare`` wrote to."""
     names = _names(config, root)
-    where = prepared if root.is_file() else root
     folder = None if prepared is None else prepared / MODEL
     placed = {} if folder is None else {image.name: image for image in colmap.images(folder)}
     lenses = {} if folder is None else colmap.cameras(folder)
 
     def fill(shot: Shot) -> None:
-        if where is not None:
-            shot.image = file_in(where, shot.name, "image")
+        if root.is_file():
+            shot.image = None if prepared is None else file_in(prepared, shot.name, "image")
+        else:
+            shot.image, shot.mask = file_in(root, shot.name, "image"), mask_of(root, shot.name)
+            if (orientation := _orientation(shot.image)) != 1:
+                shot.meta["orientation"] = orientation
+                if prepared is not None and (prepared / UPRIGHT / shot.name).is_file():
+                    shot.image = file_in(prepared / UPRIGHT, shot.name, "image")
         if folder is not None:
             if shot.name not in placed:
                 size_of(shot.image, config.max_pixels)  # why pycolmap was not asked, if it was not
@@ -64,7 +75,8 @@ def read(config: Any, root: Path, prepared: Path | None = None) -> Inventory:
         shot.moment = shot.name
     points = PointSet("sfm", None, lambda: (colmap.points(folder, config.max_bytes)[1], None))
     files = [root] if root.is_file() else [root / name for name in names]
-    return Inventory(shots, [points], "sfm", units_from="images alone have no unit", decided_by=files)
+    notes = [] if root.is_file() else _left_out(root)
+    return Inventory(shots, [points], "sfm", units_from="images alone have no unit", decided_by=files, notes=notes)
 
 
 def prepare(config: Any, root: Path, folder: Path) -> None:
@@ -79,7 +91,7 @@ def prepare(config: Any, root: Path, folder: Path) -> None:
     names = _names(config, root)
     if root.is_file():
         _cut(root, folder, names)
-    images = folder if root.is_file() else root
+    images = folder if root.is_file() else _upright(root, folder, names, config.max_pixels)
     sizes = {}
     for name in names:
         with contextlib.suppress(Reject):  # told when the frame is asked for
@@ -96,6 +108,7 @@ def prepare(config: Any, root: Path, folder: Path) -> None:
         "sequential": root.is_file(),
         "side": config.sfm_side,
         "folder": str(folder.resolve()),
+        "masks": None if root.is_file() else _masks(root, folder, sizes),
     }
     (folder / JOB).write_text(json.dumps(job))
     command = [sys.executable, "-P", registration.__file__, str(folder / JOB)]
@@ -125,14 +138,66 @@ def _names(config: Any, root: Path) -> list[str]:
     """The images' names, relative to the folder; of a video, those that its frames will have."""
     if root.is_file():
         return [f"{CUT}/frame_{number:04d}.jpg" for number in range(min(config.video_frames, frame_count(root)))]
-    found = sorted(path for path in root.rglob("*") if path.suffix.lower() in PHOTOS and path.is_file())
+    found = [path for path in root.rglob("*") if path.suffix.lower() in PHOTOS and path.is_file()]
     names = [path.relative_to(root).as_posix() for path in found if inside(path, root)]
     names = [name for name in names if not any(part.startswith(".") for part in name.split("/"))]  # such as macOS's ._IMG.jpg
+    names = sorted((name for name in names if not name.startswith(f"{MASKS}/")), key=natural)
     if len(names) < FEWEST:
+        told = "".join(f"; {note}" for note in _left_out(root))
         raise UserError(
-            f"capture.path={str(root)!r} holds {len(names)} photos ({', '.join(PHOTOS)}), at least {FEWEST} are needed"
+            f"capture.path={str(root)!r} holds {len(names)} photos ({', '.join(PHOTOS)}), at least {FEWEST} are needed{told}"
         )
     return names
+
+
+def _left_out(root: Path) -> list[str]:
+    """A sentence about photos of kinds that are not read, if there are any."""
+    kinds = Counter(path.suffix.lower() for path in root.rglob("*") if path.suffix.lower() in OTHERS)
+    if not kinds:
+        return []
+    counted = ", ".join(f"{number} {kind}" for kind, number in sorted(kinds.items()))
+    return [f"photos of other kinds were left out ({counted}): save them as JPEG or PNG"]
+
+
+def _orientation(path: Path) -> int:
+    """As EXIF states it: 1 for a photo that is stored upright, or says nothing."""
+    try:
+        with Image.open(path) as image:
+            found = image.getexif().get(ORIENTATION, 1)
+    except Exception:  # decoders of strangers' files fail in every way; the frame's fault is told when it is asked for
+        return 1
+    return found if found in range(2, 9) else 1
+
+
+def _upright(root: Path, folder: Path, names: list[str], max_pixels: int) -> Path:
+    """The folder with the photos as they were held. Phones store upright ones on their side, as pycolmap would take them."""
+    turned = {name for name in names if _orientation(root / name) != 1}
+    if not turned:
+        return root
+    for name in names:
+        path = folder / UPRIGHT / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        if name not in turned:
+            path.symlink_to((root / name).resolve())
+            continue
+        with contextlib.suppress(Reject):  # told when the frame is asked for
+            image = ImageOps.exif_transpose(opened(root / name, max_pixels, "image"))
+            kind, options = ("PNG", {}) if path.suffix.lower() == ".png" else ("JPEG", {"quality": QUALITY, "subsampling": 0})
+            with atomic_path(path) as temporary:
+                image.save(temporary, kind, exif=image.getexif(), **options)  # EXIF knows the focal length
+    return folder / UPRIGHT
+
+
+def _masks(root: Path, folder: Path, names: Iterable[str]) -> str | None:
+    """The folder of the photos' masks, named as pycolmap wants them; None where there are none."""
+    found = {name: mask for name in names if (mask := mask_of(root, name)) is not None}
+    for name, mask in found.items():
+        path = folder / HIDDEN / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        path.symlink_to(mask.resolve())
+    return str((folder / HIDDEN).resolve()) if found else None
 
 
 def _cut(video: Path, folder: Path, names: list[str]) -> None:

@@ -19,6 +19,7 @@ from stages.graphics.geometry.paths import inside
 from stages.neuras.captures import poses
 from stages.neuras.captures.lenses import Lens
 from stages.neuras.captures.sources import AXES, FolderConfig, Inventory, PointSet, Shot, file_in, shot_of
+from stages.neuras.records import natural
 
 FILE = "transforms.json"
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
@@ -42,7 +43,7 @@ def read(config: FolderConfig, root: Path) -> Inventory:
     if model not in MODELS:
         raise UserError(f"{path}: camera_model {model!r} is not read ({', '.join(MODELS)} are): undistort the images first")
     named = _named(told)
-    frames = sorted(frames, key=lambda frame: (_time(frame) or 0.0, str(frame.get("file_path", ""))))
+    frames = sorted(frames, key=lambda frame: (_time(frame) or 0.0, natural(str(frame.get("file_path", "")))))
     timed = all(_time(frame) is not None for frame in frames)
 
     def shot(frame: dict[str, Any]) -> Shot:

@@ -47,7 +47,7 @@ class Original:
 def made(original: Original, max_side: int | None, max_pixels: int) -> Picture:
     """The picture as a pinhole of at most ``max_side`` pixels sees it; raises Reject."""
     lens = original.lens
-    image = _opened(original.image, max_pixels, "image")
+    image = opened(original.image, max_pixels, "image")
     if image.size != (lens.width, lens.height):
         raise Reject("size", _other_size(image.size, lens))
     if original.backdrop is not None and image.has_transparency_data:
@@ -78,7 +78,7 @@ def _mask(original: Original, size: tuple[int, int], max_pixels: int) -> np.ndar
     width, height = size
     mask = np.ones((height, width), bool)
     if original.mask is not None:
-        mask = np.array(_opened(original.mask, max_pixels, "mask").convert("L")) > 0
+        mask = np.array(opened(original.mask, max_pixels, "mask").convert("L")) > 0
         if mask.shape != (height, width):
             raise Reject("mask_size", f"the mask has {_times(mask.shape[::-1])} pixels, the image {_times(size)}")
     drawn = _drawn(mask)
@@ -124,7 +124,7 @@ def _fitting(size: tuple[int, int], max_side: int | None) -> tuple[int, int]:
     return tuple(max(round(side * max_side / max(size)), 1) for side in size)
 
 
-def _opened(path: Path, max_pixels: int, what: str) -> Image.Image:
+def opened(path: Path, max_pixels: int, what: str) -> Image.Image:
     """The decoded file, of 8 bits a channel; its stated size is checked before anything is decoded."""
     try:
         with warnings.catch_warnings():

@@ -1,8 +1,8 @@
 """Poses and points of images by pycolmap, as a program of its own: ``python -P registration.py JOB``.
 
 It imports nothing of the project. JOB is a JSON file: images (folder), names, one_camera, sequential, side (pixels that
-features are looked for at), folder (where the model goes, below ``sparse/0``). A process of its own, because a fault in native
-code then costs no run.
+features are looked for at), masks (folder, or null), folder (where the model goes, below ``sparse/0``). A process of its own,
+because a fault in native code then costs no run.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def main(job_file: Path) -> None:
         images,
         image_names=job["names"],
         camera_mode=mode,
-        reader_options=pycolmap.ImageReaderOptions(camera_model="OPENCV"),
+        reader_options=pycolmap.ImageReaderOptions(camera_model="OPENCV", mask_path=job["masks"] or ""),
         extraction_options=extraction,
         device=pycolmap.Device.cpu,
     )

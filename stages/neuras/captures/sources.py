@@ -28,6 +28,7 @@ from stages.neuras.captures.lenses import Lens
 from stages.neuras.records import FRAME, POINTS, CaptureInfo, FrameRecord, Mesh, PointsRecord, Split
 
 FEWEST = 3  # usable frames
+MASKS = "masks"  # beside the images of sets that name no masks
 FAR_AWAY = 10_000.0  # world units from the origin, beyond which a small place is moved to it
 SEEN = 50_000  # points that decide the capture's ball
 AXES = {sign + name: tuple((-1.0 if sign else 1.0) * (name == axis) for axis in "xyz") for name in "xyz" for sign in ("", "-")}
@@ -114,7 +115,7 @@ class PointSet:
 @dataclass
 class Inventory:
     """What a reader finds. units and up: None where the set does not say. units_from: where it says so, in words. mesh: the
-    files of the set's own mesh. decided_by: files that decide every frame and all points.
+    files of the set's own mesh. decided_by: files that decide every frame and all points. notes: sentences for the user.
     """
 
     shots: list[Shot]
@@ -125,6 +126,7 @@ class Inventory:
     up: tuple[float, float, float] | None = None
     mesh: list[Path] = field(default_factory=list)
     decided_by: list[Path] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def shot_of(name: str, fill: Callable[[Shot], None]) -> Shot:
@@ -145,6 +147,17 @@ def file_in(root: Path, name: Any, what: str) -> Path:
     if not path.is_file():
         raise Reject(f"no_{what}", f"there is no file {name!r}")
     return path
+
+
+def mask_of(root: Path, name: str) -> Path | None:
+    """The mask of an image of a set that names none: ``masks/NAME.png``, as COLMAP has it, or with the image's suffix replaced.
+
+    None where there is no such file; a Reject where it leads out of ``root``.
+    """
+    for named in (f"{MASKS}/{name}.png", f"{MASKS}/{PurePosixPath(name).with_suffix('.png')}"):
+        if (root / named).is_file():
+            return file_in(root, named, "mask")
+    return None
 
 
 def json_in(root: Path, path: Path, kind: type) -> Any:

@@ -12,17 +12,29 @@ import numpy as np
 
 from pipeline.errors import UserError
 from stages.graphics.cameras import Camera
-from stages.neuras.records import FrameRecord
+from stages.neuras.records import FrameRecord, natural
 
 RIGID = 1e-3  # how far a pose's axes may be from length 1 and right angles
 LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h")  # what a file may say of the lens, all of it or nothing
 
 
 def driven(frames: Iterable[FrameRecord]) -> list[Camera]:
-    """The cameras of the frames on the driven path, in the order of their times, or of their ids where one has none."""
-    along = [(frame.time, frame.id, frame.camera) for frame in frames if frame.split != "shift"]
-    timed = all(time is not None for time, _, _ in along)
-    return [camera for _, _, camera in sorted(along, key=lambda it: it[:2] if timed else it[1:2])]
+    """The cameras of the frames on the driven path, in the order of their times, or of their ids where one has none.
+
+    Of several cameras that drove together, those of the one that looks ahead.
+    """
+    along = [frame for frame in frames if frame.split != "shift"]
+    timed = all(frame.time is not None for frame in along)
+    along = sorted(along, key=lambda frame: (frame.time if timed else 0, natural(frame.id)))
+    paths: dict[Any, list[Camera]] = {}
+    for frame in along:
+        paths.setdefault(frame.meta.get("camera"), []).append(frame.camera)
+    return max(paths.values(), key=_looks_ahead)
+
+
+def _looks_ahead(path: Sequence[Camera]) -> float:
+    """How far the cameras came in the directions that they look in, world units."""
+    return sum(float(a.forward @ (b.position - a.position)) for a, b in zip(path[:-1], path[1:], strict=True))
 
 
 def smooth(cameras: Sequence[Camera], count: int) -> list[Camera]:

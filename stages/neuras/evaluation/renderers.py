@@ -54,7 +54,7 @@ class Reference:
         if self._residuals is None:
             return {"ours": colours.reshape(shape)}
         eye = camera.position - self._baked.sky_centre
-        added = self._residuals.at(eye, rays, view.depth.ravel().astype(float))
+        added = self._residuals.at(eye, camera.forward, rays, view.depth.ravel().astype(float))
         both = np.clip(colours + added, 0, 1).astype(np.float32)
         return {"ours": both.reshape(shape), "textures": colours.reshape(shape)}
 

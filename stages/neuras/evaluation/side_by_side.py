@@ -27,6 +27,7 @@ class Run:
     name: str
     capture: str
     summary: Mapping[str, Any]
+    scored: tuple[tuple[str, str], ...] = ()  # settings that decide which pixels are scored, and after which help
 
     @classmethod
     def of(cls, store: Store, reference: str) -> Run:
@@ -36,7 +37,9 @@ class Run:
         if artifact.stage != "evaluate" or "bake" not in artifact.manifest["preimage"]["inputs"]:
             raise UserError(f"{artifact.name} is no evaluation of a fitted scene: `lightmill ls neuras/evaluate` lists them")
         summary = json.loads(artifact.file("metrics.json").read_bytes())
-        return cls(name or artifact.name, artifact.manifest["preimage"]["inputs"]["capture"], summary)
+        config = artifact.manifest["config"]
+        scored = tuple((name, config.get(name, "none")) for name in ("exposure", "poses"))
+        return cls(name or artifact.name, artifact.manifest["preimage"]["inputs"]["capture"], summary, scored)
 
     def scores(self, ids: Sequence[str], method: str) -> list[Scores]:
         views = {view["id"]: view["scores"] for view in self.summary["per_view"]}
@@ -52,6 +55,9 @@ def side_by_side(runs: Sequence[Run]) -> Table:
     seen = {(run.capture, *sorted(view["id"] for view in run.summary["per_view"])) for run in runs}
     if len(seen) > 1:
         raise UserError("these evaluations are not of the same frames of one capture: their scores cannot be compared")
+    if len({run.scored for run in runs}) > 1:
+        ways = "; ".join(f"{run.name}: " + " ".join(f"evaluate.{name}={how}" for name, how in run.scored) for run in runs)
+        raise UserError(f"these evaluations do not score the same pixels, so they cannot be compared ({ways})")
     columns = [(run.name, run, "ours") for run in runs] + [(METHODS["warping"], first, "warping")]
     rows: list[list[Any]] = []
     for group in main_groups(first.summary):

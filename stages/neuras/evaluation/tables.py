@@ -61,7 +61,7 @@ class Made:
 
     @property
     def held_out(self) -> list[Mapping[str, Any]]:
-        """What is known of each view that the tables are of."""
+        """What is known of each view that the tables are of; none where ``evaluate.splits`` leaves them out."""
         return [view for view in self.summary["per_view"] if view["split"] == "test"]
 
     def beside(self, metres: float) -> list[Mapping[str, Any]]:
@@ -220,7 +220,7 @@ LEAD = (
 
 def gather(table: PaperTable, found: Mapping[str, Made], jobs: Mapping[str, Job]) -> dict[str, Any]:
     """Everything that the table says, as plain JSON."""
-    base = next((row for row in table.rows if row.file in found), None)
+    base = next(row for row in table.rows if row.file)  # columns say "the first row": without it there is none
     rows = []
     for row in table.rows:
         entry: dict[str, Any] = {"label": row.label, "file": row.file, "method": row.method, "published": dict(row.figures)}
@@ -229,7 +229,7 @@ def gather(table: PaperTable, found: Mapping[str, Made], jobs: Mapping[str, Job]
             values = {name: COLUMNS[name].value(result, row.method) for name in table.columns}
             entry["ours"] = {name: value for name, value in values.items() if value is not None}
             entry["evaluate"] = result.evaluated.key
-            if table.paired and base is not None and row is not base:
+            if table.paired and base.file in found and row is not base:
                 for name, (metres, _) in GAINS.items():
                     entry[name] = gain(result, row.method, found[base.file], base.method, metres)
         rows.append(entry)
@@ -279,7 +279,8 @@ def here(row: Made, job: Job) -> list[tuple[str, str]]:
             f"{drawn['drawn_by']}, {drawn['size'][0]} x {drawn['size'][1]}; "
             f"{drawn['ratio']:.1f} times the time of a plain textured mesh"
         )
-    if networks := [name for name in row.held_out[0]["scores"]["ours"] if name.startswith("lpips_")]:
+    scored = row.summary["per_view"][0]["scores"]["ours"]
+    if networks := [name for name in scored if name.startswith("lpips_")]:
         facts["LPIPS"] = f"by {networks[0].removeprefix('lpips_')}"
     if sets:
         facts["FID"] = (
@@ -353,7 +354,8 @@ def pictures(table: PaperTable, found: Mapping[str, Made]) -> list[Picture]:
         if row.file not in found:
             continue
         result = found[row.file]
-        views = sorted(result.held_out, key=lambda view: (view["scores"]["ours"]["psnr"], view["id"]))
+        views = result.held_out or result.summary["per_view"]
+        views = sorted(views, key=lambda view: (view["scores"]["ours"]["psnr"], view["id"]))
         if not id or not table.paired:
             id = views[len(views) // 2]["id"]
             out.append(Picture(thumbnail(result.picture(id, "photo")), f"photo {id}"))

@@ -18,7 +18,7 @@ from stages.neuras.baking.drawing import Drawing
 from stages.neuras.evaluation import scores
 from stages.neuras.evaluation.renderers import Reference, as_bytes
 from stages.neuras.evaluation.warping import Warping
-from stages.neuras.rasterizing.photos import Source
+from stages.neuras.rasterizing.photos import Source, nearest
 from stages.neuras.records import AtlasMesh, FrameRecord, Mesh, fitted_poses, posed
 from stages.neuras.surfaces import photometric
 
@@ -51,7 +51,7 @@ class Aligner:
 
     def align(self, camera: Camera, image: np.ndarray, counts: np.ndarray) -> Camera:
         """``counts``: (H, W) bool, the pixels that may be looked at."""
-        near = photometric.nearest(self._photos.cameras, camera.position, self._settings.neighbours)
+        near = nearest(self._photos.cameras, camera, self._settings.neighbours)
         frames = [self._photos.read(self._photos.training[number]) for number in near]
         photos = [photometric.Photo(frame.camera, frame.image(), frame.counts()) for frame in frames]
         return photometric.align(photometric.Photo(camera, image, counts), self._mesh, photos, self._settings)

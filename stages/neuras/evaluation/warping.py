@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster
-from stages.neuras.rasterizing.photos import FAR, Source, look_up
+from stages.neuras.rasterizing.photos import FAR, Source, look_up, nearest
 
 
 class Warping:
@@ -33,7 +33,7 @@ class Warping:
         rays: int = 1,
     ):
         self.caster = caster
-        self.positions = np.array([camera.position for camera in cameras])
+        self.cameras = cameras
         self.source = source
         self.far = radius * FAR
         self.nearest, self.rays = nearest, rays
@@ -54,9 +54,9 @@ class Warping:
         points = camera.position + directions * np.where(view.hit, view.depth, self.far)[..., None]
         total = np.zeros((camera.height, camera.width, 3))
         weights = np.zeros((camera.height, camera.width))
-        distances = np.linalg.norm(self.positions - camera.position, axis=1)
-        for index in np.argsort(distances, kind="stable")[: self.nearest]:
-            colour, sees = look_up(self.source(int(index)), points, view.hit)
+        distances = np.linalg.norm(np.array([other.position for other in self.cameras]) - camera.position, axis=1)
+        for index in nearest(self.cameras, camera, self.nearest):
+            colour, sees = look_up(self.source(index), points, view.hit)
             weight = sees / (distances[index] + max(1e-3 * distances.max(), 1e-9))
             total += colour * weight[..., None]
             weights += weight

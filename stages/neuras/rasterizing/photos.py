@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from stages.graphics.cameras import Camera
 from stages.graphics.casting import GBuffer
 
 TOLERANCE = 0.02  # relative difference of depth under which a source sees the same point
+ELSEWHERE = np.cos(np.radians(60))  # of the angle between where two cameras look that hardly show the same
 FAR = 1e6  # in scene radii: where a pixel without a point is taken to lie
 
 
@@ -41,3 +43,15 @@ def look_up(source: Source, points: np.ndarray, on_mesh: np.ndarray) -> tuple[np
     sees = inside & source.counts[row, column] & np.where(on_mesh, same & (stored > 0), stored == 0)
     colour = np.stack([map_coordinates(source.image[..., c], [y, x], order=1, mode="nearest") for c in range(3)], axis=-1)
     return colour, sees
+
+
+def nearest(cameras: Sequence[Camera], camera: Camera, count: int) -> list[int]:
+    """The ``count`` cameras nearest to ``camera``, nearest first; those that look elsewhere behind all others, however near."""
+    away = np.linalg.norm(np.array([other.position for other in cameras]) - camera.position, axis=1)
+    elsewhere = np.array([other.forward for other in cameras]) @ camera.forward < ELSEWHERE
+    return [int(number) for number in np.lexsort((away, elsewhere))[:count]]
+
+
+def beside(cameras: Sequence[Camera], number: int, count: int) -> list[int]:
+    """The ``count`` other cameras `nearest` to one of them."""
+    return [other for other in nearest(cameras, cameras[number], count + 1) if other != number][:count]

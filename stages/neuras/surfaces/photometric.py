@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from stages.graphics.cameras import Camera
 from stages.graphics.casting import Caster
 from stages.graphics.geometry import measure
+from stages.neuras.rasterizing.photos import beside, nearest
 from stages.neuras.records import Mesh
 
 LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)
@@ -96,7 +97,7 @@ def follow(camera: Camera, before: Sequence[Camera], after: Sequence[Camera]) ->
     alike = [number for number, other in enumerate(before) if _turn(camera, other) < ALIKE]
     if not alike:
         return camera
-    near = [alike[number] for number in nearest([before[number] for number in alike], camera.position, FOLLOWED)]
+    near = [alike[number] for number in nearest([before[number] for number in alike], camera, FOLLOWED)]
     away = np.array([np.linalg.norm(before[number].position - camera.position) for number in near])
     weights = 1 / np.maximum(away, 1e-3 * max(away.max(), 1e-9))
     motions = np.array([motion_between(before[number], after[number]) for number in near])
@@ -373,14 +374,3 @@ def _differences(mesh: Mesh) -> sparse.csr_matrix:
     starts = np.arange(0, edges.size + 1, 2)
     along = sparse.csr_matrix((np.tile([1.0, -1.0], len(edges)), edges.ravel(), starts), (len(edges), len(mesh.vertices)))
     return (along.T @ along).tocsr()
-
-
-def beside(cameras: Sequence[Camera], number: int, count: int) -> list[int]:
-    """The ``count`` other cameras nearest to one of them, nearest first."""
-    return [other for other in nearest(cameras, cameras[number].position, count + 1) if other != number][:count]
-
-
-def nearest(cameras: Sequence[Camera], position: np.ndarray, count: int) -> list[int]:
-    """The ``count`` cameras nearest to ``position`` (3,), nearest first."""
-    away = np.linalg.norm(np.array([camera.position for camera in cameras]) - position, axis=1)
-    return [int(number) for number in np.argsort(away, kind="stable")[:count]]

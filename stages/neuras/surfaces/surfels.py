@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from stages.graphics.casting import Caster
-from stages.neuras.rasterizing.photos import FAR, Source, look_up
+from stages.neuras.rasterizing.photos import FAR, Source, beside, look_up
 from stages.neuras.records import Mesh
-from stages.neuras.surfaces import photometric
+from stages.neuras.surfaces.photometric import Photo
 
 
 def at_points(points: np.ndarray, viewers: np.ndarray, side: float) -> Mesh:
@@ -40,7 +40,7 @@ def nearest(squares: Mesh, eyes: Sequence[np.ndarray], most: int) -> Mesh:
     return Mesh.compact(squares.vertices, squares.faces.reshape(-1, 2, 3)[kept].reshape(-1, 3))
 
 
-def seen_through(mesh: Mesh, count: int, photos: Sequence[photometric.Photo], neighbours: int) -> np.ndarray:
+def seen_through(mesh: Mesh, count: int, photos: Sequence[Photo], neighbours: int) -> np.ndarray:
     """(S,) bool of the squares, the last ``count`` faces of the mesh: whether photos rather show what lies behind.
 
     A pixel of a photo that meets a square is told from the nearest ``neighbours`` other photos, twice: by the point on the
@@ -68,7 +68,7 @@ def seen_through(mesh: Mesh, count: int, photos: Sequence[photometric.Photo], ne
         _, _, depth = surface.cast(np.broadcast_to(camera.position, rays.shape), rays)
         near = camera.position + rays * own.view.depth[on_square][:, None]
         beyond = camera.position + rays * np.where(depth > 0, depth, far)[:, None]
-        sources = [source(other) for other in photometric.beside(cameras, number, neighbours)]
+        sources = [source(other) for other in beside(cameras, number, neighbours)]
         told = [_told(sources, points, on_mesh) for points, on_mesh in ((near, np.ones(len(rays), bool)), (beyond, depth > 0))]
         judged = told[0][1] & told[1][1]
         errors = [((colour - own.image[on_square]) ** 2).mean(axis=-1)[judged] for colour, _ in told]

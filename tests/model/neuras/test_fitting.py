@@ -323,8 +323,14 @@ class Killed(Exception):
     pass
 
 
-def test_a_run_that_was_killed_ends_with_the_same_bytes(tmp_path, monkeypatch):
-    run(tmp_path / "whole")[0].save(tmp_path / "whole" / "out")
+@pytest.mark.parametrize(
+    ("change", "sky"), [({}, True), ({"quantize_from": 0.9}, True), ({}, False)], ids=["default", "codes wait", "no sky"]
+)
+def test_a_run_that_was_killed_ends_with_the_same_bytes(tmp_path, monkeypatch, change, sky):
+    """Also where some parameters had no gradient yet, so that the optimizer knows nothing of them."""
+    config = dataclasses.replace(CONFIG, **change)
+    views = [dataclasses.replace(one, counts=one.counts if sky else one.hit) for one in map(view, np.linspace(-1.5, 1.5, 12))]
+    run(tmp_path / "whole", config, views)[0].save(tmp_path / "whole" / "out")
     step = fitting.Trainer.train_step
     for stop in (17, 45):
 
@@ -335,10 +341,10 @@ def test_a_run_that_was_killed_ends_with_the_same_bytes(tmp_path, monkeypatch):
 
         monkeypatch.setattr(fitting.Trainer, "train_step", train_step)
         with pytest.raises(Killed):
-            run(tmp_path / "cut")
+            run(tmp_path / "cut", config, views)
     monkeypatch.setattr(fitting.Trainer, "train_step", step)
     for _ in range(2):  # and once more, with everything done
-        run(tmp_path / "cut")[0].save(tmp_path / "cut" / "out")
+        run(tmp_path / "cut", config, views)[0].save(tmp_path / "cut" / "out")
         for name in ("model.safetensors", "model.json"):
             assert (tmp_path / "cut" / "out" / name).read_bytes() == (tmp_path / "whole" / "out" / name).read_bytes()
     assert (tmp_path / "cut" / "log.jsonl").read_text() == (tmp_path / "whole" / "log.jsonl").read_text()

@@ -4,6 +4,7 @@ import { fetched } from "./loader.js";
 
 const LOADS = 2; // photos at a time
 const AGAIN_MS = 5000; // until a file that could not be read is tried once more
+const ALIKE = Math.cos(Math.PI / 4), UNLIKE = Math.cos((5 * Math.PI) / 12); // as in Python
 
 export class Residuals {
   constructor(viewer) {
@@ -27,10 +28,14 @@ export class Residuals {
     return texture;
   }
 
-  // The photos of a view from there, with their weights: as Residuals.chosen in Python.
-  chosen(eye) {
-    const { nearest, soft } = this.about;
-    for (const photo of this.photos) photo.distance = Math.hypot(...eye.map((x, axis) => x - photo.eye[axis]));
+  // The photos of a pose's view, with their weights: as Residuals.chosen in Python.
+  chosen({ eye, back }) {
+    const { nearest, soft, off_mesh } = this.about;
+    for (const photo of this.photos) {
+      const cosine = -photo.matrix[2].slice(0, 3).reduce((sum, x, axis) => sum + x * back[axis], 0);
+      const elsewhere = Math.min(Math.max((ALIKE - cosine) / (ALIKE - UNLIKE), 0), 1);
+      photo.distance = Math.hypot(...eye.map((x, axis) => x - photo.eye[axis])) + off_mesh * elsewhere;
+    }
     const order = [...this.photos].sort((a, b) => a.distance - b.distance).slice(0, nearest + 1);
     const last = order.length > nearest ? 1 / (order[nearest].distance + soft) : 0;
     const chosen = order.slice(0, nearest);
@@ -40,9 +45,9 @@ export class Residuals {
     return chosen;
   }
 
-  // Asks for photos that a view from there takes and that are not here; returns those that it takes.
-  step(eye) {
-    const chosen = this.chosen(eye), now = performance.now();
+  // Asks for photos that a pose's view takes and that are not here; returns those that it takes.
+  step(pose) {
+    const chosen = this.chosen(pose), now = performance.now();
     for (const photo of chosen) photo.wanted = ++this.clock;
     for (const photo of chosen)
       if (photo.state === "away" && photo.again <= now && this.loading < LOADS) this.load(photo, chosen);
@@ -84,15 +89,15 @@ export class Residuals {
   }
 
   // Whether all photos of this view are here. Throws where one cannot be read.
-  settled(eye) {
-    const chosen = this.step(eye), problem = chosen.find((photo) => photo.problem)?.problem;
+  settled(pose) {
+    const chosen = this.step(pose), problem = chosen.find((photo) => photo.problem)?.problem;
     if (problem) throw problem;
     return chosen.every(({ state }) => state === "here");
   }
 
-  // Binds both textures from a unit on and sets the uniforms of programs, for a view from there.
-  use(programs, unit, eye) {
-    const { gl } = this, chosen = this.step(eye), count = this.about.nearest;
+  // Binds both textures from a unit on and sets the uniforms of programs, for a pose's view.
+  use(programs, unit, pose) {
+    const { gl } = this, chosen = this.step(pose), count = this.about.nearest;
     const matrices = new Float32Array(16 * count), eyes = new Float32Array(3 * count), about = new Float32Array(4 * count);
     chosen.forEach((photo, k) => {
       if (!this.on || photo.state !== "here") return;

@@ -64,7 +64,7 @@ class Viewer {
     const largest = gl.getParameter(gl.MAX_TEXTURE_SIZE), layers = gl.getParameter(gl.MAX_ARRAY_TEXTURE_LAYERS);
     const { mesh, skyboxes } = scene;
     if (Math.max(mesh.width, mesh.height, skyboxes.side) > largest || 6 * skyboxes.count > layers)
-      throw new Error(`The texture is ${mesh.width} x ${mesh.height}; this browser takes ${largest}. Bake a smaller one: atlas.size=${largest}`);
+      throw new Error(`The texture is ${mesh.width} x ${mesh.height}; this browser takes ${largest}. Bake a smaller one: atlas.max_megatexels, or bake.tile_m=50`);
     this.mesh = this.program(scene.shaders.mesh);
     this.sky = this.program(scene.shaders.sky);
     this.resolve = this.program(scene.shaders.resolve);
@@ -199,7 +199,7 @@ class Viewer {
       gl.bindTexture(target, texture);
       set(program, name, "uniform1i", index);
     });
-    this.residuals?.use([this.mesh, this.sky], this.textures.length, pose.eye);
+    this.residuals?.use([this.mesh, this.sky], this.textures.length, pose);
     gl.useProgram(this.mesh);
     const matrix = multiply(projection(this.lens, scene.near, scene.far), viewOf(pose));
     set(this.mesh, "clip_from_scene", "uniformMatrix4fv", false, transposed(matrix));
@@ -230,7 +230,7 @@ class Viewer {
   }
 
   settled() { // whether all is here that this view shows
-    return !this.residuals || this.residuals.settled(this.camera().eye);
+    return !this.residuals || this.residuals.settled(this.camera());
   }
 
   goTo(index) { // a drive ends there
