@@ -182,16 +182,21 @@ def _upright(root: Path, folder: Path, names: list[str], max_pixels: int) -> Pat
             path.symlink_to((root / name).resolve())
             continue
         with contextlib.suppress(Reject):  # told when the frame is asked for
-            image = ImageOps.exif_transpose(opened(root / name, max_pixels, "image"))
-            kind, options = ("PNG", {}) if path.suffix.lower() == ".png" else ("JPEG", {"quality": QUALITY, "subsampling": 0})
+            photo = opened(root / name, max_pixels, "image")
+            kind, options = ("PNG", {}) if photo.format == "PNG" else ("JPEG", {"quality": QUALITY, "subsampling": 0})
+            upright = ImageOps.exif_transpose(photo)
             with atomic_path(path) as temporary:
-                image.save(temporary, kind, exif=image.getexif(), **options)  # EXIF knows the focal length
+                upright.save(temporary, kind, exif=upright.getexif(), **options)  # EXIF knows the focal length
     return folder / UPRIGHT
 
 
 def _masks(root: Path, folder: Path, names: Iterable[str]) -> str | None:
     """The folder of the photos' masks, named as pycolmap wants them; None where there are none."""
-    found = {name: mask for name in names if (mask := mask_of(root, name)) is not None}
+    found: dict[str, Path] = {}
+    for name in names:
+        with contextlib.suppress(Reject):  # told when the frame is asked for
+            if (mask := mask_of(root, name)) is not None:
+                found[name] = mask
     for name, mask in found.items():
         path = folder / HIDDEN / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
