@@ -138,9 +138,11 @@ class CaptureInfo:
         return cls(**unpack_json(capture.file("capture.json").read_bytes()))
 
 
-def natural(name: str) -> list[tuple[bool, int, str]]:
+def natural(name: str) -> list[tuple[int, str, str]]:
     """A key by which names sort as people count: 2.png before 10.png."""
-    return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)]
+    parts = re.split(r"([0-9]+)", name)  # text and digits by turns
+    digits = [part.lstrip("0") if number % 2 else "" for number, part in enumerate(parts)]
+    return [(len(value), value, part) for value, part in zip(digits, parts, strict=True)]
 
 
 def frames(capture: Artifact, *splits: Split) -> Iterator[FrameRecord]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 from scipy.ndimage import gaussian_filter
 
 from pipeline.config import parse
@@ -18,7 +18,7 @@ from pipeline.run import run_pipeline
 from pipeline.store.files import hash_file
 from stages.graphics.video import frame_count, write_video
 from stages.neuras.captures import images
-from stages.neuras.records import CaptureInfo, frames, point_sets
+from stages.neuras.records import CaptureInfo, frames, natural, point_sets
 from stages.neuras.s00_capture import Capture
 from tests.neuras.test_captures import POINT, colmap_model, dot_of, real
 
@@ -125,6 +125,7 @@ def test_photos_are_taken_in_the_order_that_people_count_in(tmp_path):
         Image.new("RGB", (8, 8)).save(tmp_path / f"IMG_{number}.png")
     config = parse(Capture.Config, {"name": "images", "path": str(tmp_path)}, "capture")
     assert [shot.name for shot in images.read(config, tmp_path).shots] == [f"IMG_{n}.png" for n in (1, 2, 9, 10, 100)]
+    assert sorted(["b", "a010", "a9" * 3, "a9", "9" * 9000], key=natural) == ["9" * 9000, "a9", "a9a9a9", "a010", "b"]
 
 
 def test_every_photo_is_part_of_every_key(tmp_path, registered):
@@ -136,7 +137,41 @@ def test_every_photo_is_part_of_every_key(tmp_path, registered):
 
     before = items()
     Image.open(photos / "03.png").rotate(180).save(photos / "03.png")
-    assert len(before) == 7 and all(before[id] != value for id, value in items().items())  # all poses may be others
+    turned = items()
+    assert len(before) == 7 and all(before[id] != value for id, value in turned.items())  # all poses may be others
+    (photos / "masks").mkdir()
+    Image.new("L", Image.open(photos / "00.png").size, 255).save(photos / "masks" / "00.png.png")
+    masked = items()
+    assert all(turned[id] != value for id, value in masked.items())
+    shutil.move(photos / "masks" / "00.png.png", photos / "masks" / "01.png.png")
+    assert all(masked[id] != value for id, value in items().items())
+    shutil.rmtree(photos / "masks")
+    exif = Image.Exif()
+    exif[images.ORIENTATION] = 3
+    Image.open(photos / "03.png").save(photos / "03.png", exif=exif)
+    with_word = items()
+    assert all(turned[id] != value for id, value in with_word.items())
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+def test_a_photo_is_turned_as_pillow_turns_it(tmp_path, orientation):
+    picture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (6, 9, 3), np.uint8))
+    exif = picture.getexif()
+    exif[images.ORIENTATION], exif[0x0110] = orientation, "a phone"
+    picture.save(tmp_path / "lying.png", exif=exif)
+    images._save_turned(Image.open(tmp_path / "lying.png"), orientation, tmp_path / "upright.png")
+    upright = Image.open(tmp_path / "upright.png")
+    assert np.array_equal(np.array(upright), np.array(ImageOps.exif_transpose(Image.open(tmp_path / "lying.png"))))
+    assert upright.getexif()[0x0110] == "a phone" and upright.getexif()[images.ORIENTATION] == 1
+
+
+def test_odd_photos_are_turned_too(tmp_path, monkeypatch):
+    Image.new("RGBA", (9, 6)).save(tmp_path / "photo.jpg", "WEBP")  # called so by whoever saved it
+    images._save_turned(Image.open(tmp_path / "photo.jpg"), 6, tmp_path / "upright.jpg")
+    assert Image.open(tmp_path / "upright.jpg").size == (6, 9)
+    monkeypatch.setattr(Image.Exif, "tobytes", lambda self: 1 / 0)  # as it fails where a byte is damaged
+    images._save_turned(Image.open(tmp_path / "photo.jpg"), 6, tmp_path / "again.jpg")
+    assert Image.open(tmp_path / "again.jpg").size == (6, 9)
 
 
 def test_a_change_of_the_unit_registers_once_and_takes_the_frames_over(tmp_path, registered):

@@ -32,16 +32,26 @@ def moved(place: Sequence[float], size: tuple[int, int] = (96, 64)) -> Camera:
     return scenes.looking_at(tuple(np.add(CENTRE, place)), CENTRE, size)
 
 
-class World:
-    """A scene whose photos are its own pictures, changed by ``change(picture, number)``, values in [0, 255]."""
+def turned(camera: Camera) -> Camera:
+    """So far to the side that it looks neither alike nor quite elsewhere."""
+    pose = camera.camera_to_world.copy()
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("y", 60, degrees=True).as_matrix()
+    return replace(camera, camera_to_world=pose)
 
-    def __init__(self, site: Path, change, masks=None, nearest: int = 4, angle: float = 5.0, size=(96, 64), rays: int = 1):
+
+class World:
+    """A scene whose photos are its own pictures, changed by ``change(picture, number)``, values in [0, 255]. aside: numbers of
+    photos that are `turned`."""
+
+    def __init__(
+        self, site: Path, change, masks=None, nearest: int = 4, angle: float = 5.0, size=(96, 64), rays: int = 1, aside=()
+    ):
         self.atlas = scenes.atlas(centre=CENTRE)
         self.baked = replace(scenes.baked(self.atlas, centre=CENTRE), rays=rays)
         self.plain = Reference(self.baked, self.atlas)
         self.frames = []
         for number, place in enumerate(PLACES):
-            camera = moved(place, size)
+            camera = turned(moved(place, size)) if number in aside else moved(place, size)
             picture = np.clip(np.rint(change(255 * self.plain.render(camera), number)), 0, 255).astype(np.uint8)
             mask = None if masks is None else _png(np.uint8(255) * masks(picture.shape[:2], number))
             self.frames.append(FrameRecord(f"frame-drive_{number}", camera, _png(picture), "train", mask=mask))
@@ -223,7 +233,7 @@ def test_opengl_draws_what_torch_computes(tmp_path, monkeypatch):
     except UserError as error:
         pytest.skip(str(error))
     monkeypatch.setattr(residuals, "LAYERS", 4)
-    world = World(tmp_path, checkered)
+    world = World(tmp_path, checkered, aside=(1, 2))
     assert world.residuals.layers == 4 < len(PLACES)
     with drawing.Drawing(world.baked, world.atlas, *RANGE, residuals=world.residuals) as scene:
         for place in [*SHOWN, SHOWN[0]]:
@@ -236,7 +246,7 @@ def test_opengl_draws_what_torch_computes(tmp_path, monkeypatch):
 def test_the_page_draws_what_torch_computes_and_can_do_without(tmp_path):
     if find_browser() is None:
         pytest.skip("no Chromium: install chromium")
-    world = World(tmp_path, checkered, size=(160, 120))
+    world = World(tmp_path, checkered, size=(160, 120), aside=(1, 2))
     shown = [FrameRecord(f"frame-held_{n}", moved(place, (160, 120)), _png(np.zeros((120, 160, 3), np.uint8)), "test")
              for n, place in enumerate(SHOWN)]  # fmt: skip
     write_site(tmp_path, world.baked, world.atlas, INFO, shown, RANGE, "fp16", photos=world.residuals)

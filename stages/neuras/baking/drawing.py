@@ -152,6 +152,7 @@ class Drawing:
                 if old is not None:  # OpenGL's objects outlive Python's
                     for part in (old, *old.color_attachments, old.depth_attachment):
                         part.release()
+            self._target = self._fine = None
             self._target, self._fine = (self._framebuffer(camera, rays) for rays in (1, self._rays))
         pose = camera.camera_to_world
         eye = pose[:3, 3] - self._centre

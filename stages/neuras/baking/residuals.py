@@ -272,7 +272,8 @@ def _threads(frames: Sequence[FrameRecord]) -> int:
     """Photos that are drawn at a time: one for each core of ours, and no more than free memory holds."""
     pixels = max((frame.camera.width * frame.camera.height for frame in frames), default=1)
     fitting = psutil.virtual_memory().available // (2 * BYTES * pixels)
-    return int(max(1, min(len(os.sched_getaffinity(0)), fitting)))
+    ours = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return int(max(1, min(ours, fitting)))
 
 
 def _sees(caster: Caster, camera: Camera) -> bool:

@@ -43,7 +43,7 @@ from stages.neuras.records import FRAME, AtlasMesh, CaptureInfo, FrameRecord
 
 PAGE = Path(__file__).parent / "page"
 SCAN, FILL = 0xDA, 0xFF  # of a JPEG: the marker before the picture's data, and a byte that may stand before any marker
-METADATA = (0xE1, 0xED, 0xFE)  # EXIF and XMP, IPTC, comments
+METADATA = {*range(0xE0, 0xF0), 0xFE} - {0xE0, 0xE2, 0xEE}  # all but what a decoder needs: JFIF, the colour profile, Adobe's
 STREAMING = "tiles.js"  # the script of a page whose scene is cut; it starts the viewer and keeps its textures filled
 
 
@@ -222,12 +222,13 @@ def _codes(path: Path, codes: np.ndarray) -> None:
 
 
 def without_metadata(jpeg: bytes) -> bytes | None:
-    """The JPEG without EXIF, XMP and comments, its picture as it was; None where the bytes are no JPEG.
+    """The JPEG without EXIF, XMP, comments and the like, its picture as it was; None where the bytes are no JPEG, or more
+    than one: phones put a video behind a photo.
 
     A site is made to be shared, and a photo's metadata say where it was taken. Browsers also turn a picture as EXIF says, and
     cameras here are those of the picture as it is stored.
     """
-    if not jpeg.startswith(b"\xff\xd8"):
+    if not (jpeg.startswith(b"\xff\xd8") and jpeg.endswith(b"\xff\xd9")):
         return None
     kept, at = [jpeg[:2]], 2
     while jpeg[at : at + 1] == b"\xff" and len(jpeg) >= at + 4:

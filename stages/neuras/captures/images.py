@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image
+from PIL.Image import Transpose
 
 from pipeline.atomic import atomic_path
 from pipeline.errors import Reject, UserError
@@ -35,6 +36,12 @@ VIDEOS = (".mp4", ".mov", ".m4v")
 CUT, MODEL, JOB = "images", "sparse/0", "job.json"  # below the prepared folder
 UPRIGHT, HIDDEN = "upright", "hidden"  # as well: what pycolmap reads where photos lie on their side, and masks as it names them
 ORIENTATION = 0x0112  # EXIF: how a photo is stored; 1 is upright
+TURNS = dict(
+    zip(range(2, 9), (
+        Transpose.FLIP_LEFT_RIGHT, Transpose.ROTATE_180, Transpose.FLIP_TOP_BOTTOM, Transpose.TRANSPOSE, Transpose.ROTATE_270,
+        Transpose.TRANSVERSE, Transpose.ROTATE_90,
+    ), strict=True)
+)  # fmt: skip
 QUALITY = 95  # of the JPEGs that are made here
 LONGEST_S = 24 * 3600  # of registration
 
@@ -61,7 +68,8 @@ def read(config: Any, root: Path, prepared: Path | None = None) -> Inventory:
             shot.image, shot.mask = file_in(root, shot.name, "image"), mask_of(root, shot.name)
             if (orientation := _orientation(shot.image)) != 1:
                 shot.meta["orientation"] = orientation
-                if prepared is not None and (prepared / UPRIGHT / shot.name).is_file():
+                if prepared is not None:
+                    size_of(shot.image, config.max_pixels)  # why there is no turned copy, if there is none
                     shot.image = file_in(prepared / UPRIGHT, shot.name, "image")
         if folder is not None:
             if shot.name not in placed:
@@ -75,8 +83,14 @@ def read(config: Any, root: Path, prepared: Path | None = None) -> Inventory:
         shot.moment = shot.name
     points = PointSet("sfm", None, lambda: (colmap.points(folder, config.max_bytes)[1], None))
     files = [root] if root.is_file() else [root / name for name in names]
+    files += [shot.mask for shot in shots if shot.mask is not None]
+    facts = {
+        "masked": [shot.name for shot in shots if shot.mask is not None],
+        "turned": [[shot.name, shot.meta["orientation"]] for shot in shots if shot.meta],
+    }
+    facts = {name: value for name, value in facts.items() if value}  # none where photos are all that there is
     notes = [] if root.is_file() else _left_out(root)
-    return Inventory(shots, [points], "sfm", units_from="images alone have no unit", decided_by=files, notes=notes)
+    return Inventory(shots, [points], "sfm", units_from="images alone have no unit", decided_by=files, facts=facts, notes=notes)
 
 
 def prepare(config: Any, root: Path, folder: Path) -> None:
@@ -166,12 +180,12 @@ def _orientation(path: Path) -> int:
             found = image.getexif().get(ORIENTATION, 1)
     except Exception:  # decoders of strangers' files fail in every way; the frame's fault is told when it is asked for
         return 1
-    return found if found in range(2, 9) else 1
+    return found if found in TURNS else 1
 
 
 def _upright(root: Path, folder: Path, names: list[str], max_pixels: int) -> Path:
     """The folder with the photos as they were held. Phones store upright ones on their side, as pycolmap would take them."""
-    turned = {name for name in names if _orientation(root / name) != 1}
+    turned = {name: orientation for name in names if (orientation := _orientation(root / name)) != 1}
     if not turned:
         return root
     for name in names:
@@ -182,12 +196,24 @@ def _upright(root: Path, folder: Path, names: list[str], max_pixels: int) -> Pat
             path.symlink_to((root / name).resolve())
             continue
         with contextlib.suppress(Reject):  # told when the frame is asked for
-            photo = opened(root / name, max_pixels, "image")
-            kind, options = ("PNG", {}) if photo.format == "PNG" else ("JPEG", {"quality": QUALITY, "subsampling": 0})
-            upright = ImageOps.exif_transpose(photo)
-            with atomic_path(path) as temporary:
-                upright.save(temporary, kind, exif=upright.getexif(), **options)  # EXIF knows the focal length
+            _save_turned(opened(root / name, max_pixels, "image"), turned[name], path)
     return folder / UPRIGHT
+
+
+def _save_turned(photo: Image.Image, orientation: int, path: Path) -> None:
+    """The photo with its pixels as it was held, and its EXIF, which knows the focal length."""
+    picture = photo.transpose(TURNS[orientation])
+    kind, options = ("PNG", {}) if photo.format == "PNG" else ("JPEG", {"quality": QUALITY, "subsampling": 0})
+    if kind == "JPEG" and picture.mode not in ("L", "RGB", "CMYK"):
+        picture = picture.convert("RGB")
+    try:
+        exif = photo.getexif()
+        exif[ORIENTATION] = 1
+        known = exif.tobytes()
+    except Exception:  # encoders of strangers' EXIF fail in every way
+        known = b""
+    with atomic_path(path) as temporary:
+        picture.save(temporary, kind, exif=known, **options)
 
 
 def _masks(root: Path, folder: Path, names: Iterable[str]) -> str | None:

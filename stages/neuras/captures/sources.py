@@ -115,7 +115,8 @@ class PointSet:
 @dataclass
 class Inventory:
     """What a reader finds. units and up: None where the set does not say. units_from: where it says so, in words. mesh: the
-    files of the set's own mesh. decided_by: files that decide every frame and all points. notes: sentences for the user.
+    files of the set's own mesh. decided_by, facts: files and what else decides every frame and all points. notes: sentences for
+    the user.
     """
 
     shots: list[Shot]
@@ -126,6 +127,7 @@ class Inventory:
     up: tuple[float, float, float] | None = None
     mesh: list[Path] = field(default_factory=list)
     decided_by: list[Path] = field(default_factory=list)
+    facts: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
@@ -271,7 +273,8 @@ class FolderSource:
     def hashes(self, hash_file: Callable[[Any], str]) -> dict[str, Any]:
         """What decides the output: per item its files' content and its facts; the mesh's content for the whole."""
         items: dict[str, Any] = {}
-        together = digest_of([hash_file(path) for path in files]) if (files := self.inventory.decided_by) else None
+        files, facts = [hash_file(path) for path in self.inventory.decided_by], self.inventory.facts
+        together = digest_of([*files, facts] if facts else files) if files else None
         for id, shot in self.shots.items():
             facts = {
                 "files": [hash_file(path) for path in (shot.image, shot.mask) if path is not None],
