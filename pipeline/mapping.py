@@ -196,10 +196,10 @@ def _check_rejects(planned: Planned, draft: Draft, items: int) -> None:
     if items and len(rejects) / items > planned.config.max_reject_share:
         counts = Counter(reject["reason"] for reject in rejects)
         listed = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
-        first = rejects[0]
+        first, name, most = rejects[0], planned.name, planned.config.max_reject_share
         raise TooManyRejects(
-            f"{planned.name}: {len(rejects)} of {items} items were rejected ({listed}), more than max_reject_share="
-            f"{planned.config.max_reject_share:g}. For example {first['item']}: {first['reason']}: {first['detail']}"
+            f"{name}: {len(rejects)} of {items} items were rejected ({listed}), more than {name}.max_reject_share={most:g}. "
+            f"For example {first['item']}: {first['reason']}: {first['detail']}"
         )
 
 

@@ -7,7 +7,7 @@ right-handed world in the capture's own unit: what follows knows no set by name.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from pipeline.config import StageConfig, added, runtime
 from pipeline.errors import UserError
 from pipeline.stage import Inputs, Item, MapStage, Record
 from stages.graphics.arrays import pack_json
-from stages.neuras.captures.sources import FolderConfig, FolderSource, Source
+from stages.neuras.captures.sources import FEWEST, FolderConfig, FolderSource, Source
 from stages.neuras.captures.splits import RuleName
 from stages.neuras.records import POINTS, FrameRecord, frames, point_sets, save
 from stages.neuras.street.settings import StreetConfig
@@ -172,11 +172,17 @@ class Capture(MapStage):
             save(draft.files / "mesh.npz", mesh)
         place = sheet.Place(info, [record.points for record in point_sets(draft)], mesh)
         views = [replace(frame, picture=b"", depth=None) for frame in frames(draft)]  # pictures may be many
+        if isinstance(source, FolderSource):
+            for note in (*source.inventory.notes, *_notes(views)):
+                draft.log(note)
+            if len(views) < FEWEST:
+                raise UserError(
+                    f"{len(views)} of {len(source.shots)} frames are left, at least {FEWEST} are needed: see the reasons why "
+                    "the others were rejected"
+                )
         shown = [FrameRecord.from_record(draft.read(views[index].id)) for index in sheet.chosen(len(views))]
         (draft.files / "contact.png").write_bytes(sheet.drawn(views, shown, place))
         draft.note("summary", sheet.summary(views, place))
-        for note in source.inventory.notes if isinstance(source, FolderSource) else ():
-            draft.log(note)
         training = [view for view in views if view.split == "train"]
         if training and isinstance(source, FolderSource):
             sanity.check(training, place.surface(), lambda id: FrameRecord.from_record(draft.read(id)))
@@ -187,6 +193,20 @@ class Capture(MapStage):
     def check(self, draft: Draft) -> None:
         if not draft.ids("train"):
             raise UserError("no training frame is left: see the rejected frames' reasons above")
+
+
+def _notes(views: Sequence[FrameRecord]) -> list[str]:
+    """Sentences about what is left of a folder's frames."""
+    found = []
+    hidden = [view.id for view in views if view.mask is not None and not view.counts().any()]
+    if hidden:
+        found.append(
+            f"masks hide all of {len(hidden)} frames, such as {hidden[0]}: in a mask 0 is ignored and all else counts; "
+            "transparency is not read"
+        )
+    if views and not any(view.split == "test" for view in views):
+        found.append("no test frame is left, so nothing can be scored: capture.split=every_other or random_half hold some out")
+    return found
 
 
 def _source(config: StageConfig, prepared: Path | None = None) -> Source:

@@ -60,10 +60,10 @@ def edit(root: Path, change) -> None:
     (root / "transforms.json").write_text(json.dumps(told))
 
 
-def run(tmp_path: Path):
-    capture = {"name": "nerfstudio", "path": str(tmp_path / "set")}
+def run(tmp_path: Path, said: list[str] | None = None, **settings):
+    capture = {"name": "nerfstudio", "path": str(tmp_path / "set"), **settings}
     root = {"system": "neuras", "stage": "capture", "store": str(tmp_path / "store"), "workers": 0, "capture": capture}
-    said: list[str] = []
+    said = [] if said is None else said
     try:
         return run_pipeline(root, [], out=said.append)["artifacts"]["capture"]
     except UserError as error:
@@ -79,6 +79,33 @@ def test_two_images(tmp_path):
     flight(tmp_path / "set", count=2)
     with pytest.raises(UserError, match="2 usable frames are too few, at least 3.*take more images"):
         run(tmp_path)
+
+
+def test_two_images_of_many_that_can_be_read(tmp_path):
+    flight(tmp_path / "set")
+    for number in range(7):
+        (tmp_path / f"set/images/{number}.png").write_bytes(b"no picture")
+    with pytest.raises(UserError, match=r"7 unreadable.*more than capture\.max_reject_share=0\.5"):
+        run(tmp_path)
+    with pytest.raises(UserError, match="2 of 9 frames are left, at least 3 are needed"):
+        run(tmp_path, max_reject_share=0.99)
+    (tmp_path / "set/images/5.png").write_bytes((tmp_path / "set/images/8.png").read_bytes())  # one trains, two are held out
+    (tmp_path / "set/images/0.png").write_bytes((tmp_path / "set/images/8.png").read_bytes())
+    (tmp_path / "set/images/8.png").write_bytes(b"no picture")
+    assert len(run(tmp_path, max_reject_share=0.99).ids("train")) < 2  # they do not stand at one place
+
+
+def test_nothing_left_to_score_and_masks_that_hide_all_are_told(tmp_path):
+    flight(tmp_path / "set")
+    for number in range(1, 9, 2):
+        (tmp_path / f"set/images/{number}.png").unlink()
+    Image.new("RGBA", SIZE, (0, 0, 0, 255)).save(tmp_path / "set/hidden.png")
+    edit(tmp_path / "set", lambda told: told["frames"][4].update(mask_path="hidden.png"))
+    said: list[str] = []
+    run(tmp_path, said)
+    told = "\n".join(said)
+    assert "no test frame is left, so nothing can be scored" in told
+    assert "masks hide all of 1 frames, such as frame-4" in told
 
 
 def test_all_the_same_pose(tmp_path):

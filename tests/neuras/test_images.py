@@ -106,6 +106,16 @@ def test_masks_beside_the_photos_are_taken(tmp_path, registered, named):
     assert np.array_equal(by_colmap.counts(), found["00.png"])
 
 
+def test_masks_of_no_image_are_told(tmp_path, registered):
+    photos, _ = registered
+    (photos / "masks").mkdir()
+    for name in ("00.png.png", "01.png", "02_mask.png", ".DS_Store"):
+        Image.new("L", (160, 120), 255).save(photos / "masks" / name, "PNG")
+    config = parse(Capture.Config, {"name": "images", "path": str(photos)}, "capture")
+    (note,) = images.read(config, photos).notes
+    assert note.startswith("1 of the files in masks/ belong to no image, such as 02_mask.png")
+
+
 def test_photos_of_other_kinds_are_told(tmp_path, registered):
     photos, _ = registered
     for name in ("a.HEIC", "b.heic", "c.webp"):

@@ -58,10 +58,15 @@ class _Handler(SimpleHTTPRequestHandler):
         pass
 
 
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, *words: object) -> None:
+        """A browser that is closed while files are on their way breaks the pipe; a page that lacks a file says so itself."""
+
+
 @contextlib.contextmanager
 def _served(site: Path) -> Iterator[str]:
     """The address at which the folder is served."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Handler, directory=str(site)))
+    server = _Server(("127.0.0.1", 0), functools.partial(_Handler, directory=str(site)))
     serving = threading.Thread(target=server.serve_forever, daemon=True)
     serving.start()
     try:

@@ -19,7 +19,7 @@ from pipeline.errors import Reject, UserError
 from stages.graphics.geometry.paths import inside
 from stages.neuras.captures import poses
 from stages.neuras.captures.lenses import Lens
-from stages.neuras.captures.sources import Inventory, PointSet, Shot, file_in, mask_of, shot_of
+from stages.neuras.captures.sources import Inventory, PointSet, Shot, file_in, mask_of, notes_on_masks, shot_of
 from stages.neuras.records import natural
 
 # name, in the order of the binary format's numbers -> number of parameters; those that are read have a lens below
@@ -54,7 +54,8 @@ def read(config: Any, root: Path) -> Inventory:
         shots.append(shot)
     found = _file(folder, "points3D")
     sets = [] if found is None else [PointSet("sfm", found, lambda: (points(folder, config.max_bytes)[1], None))]
-    return Inventory(shots, sets, "sfm" if sets else "none", units_from="COLMAP's models have no unit")
+    notes = notes_on_masks(root, shots)
+    return Inventory(shots, sets, "sfm" if sets else "none", units_from="COLMAP's models have no unit", notes=notes)
 
 
 def _fill(image: PosedImage, lens: Lens | None, root: Path, named: str, shot: Shot) -> None:

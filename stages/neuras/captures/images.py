@@ -27,7 +27,7 @@ from stages.graphics.geometry.paths import inside
 from stages.graphics.video import frame_count, read_video
 from stages.neuras.captures import colmap, registration
 from stages.neuras.captures.pictures import opened, size_of
-from stages.neuras.captures.sources import FEWEST, MASKS, Inventory, PointSet, Shot, file_in, mask_of, shot_of
+from stages.neuras.captures.sources import FEWEST, MASKS, Inventory, PointSet, Shot, file_in, mask_of, notes_on_masks, shot_of
 from stages.neuras.records import natural
 
 PHOTOS = (".jpg", ".jpeg", ".png")
@@ -89,7 +89,7 @@ def read(config: Any, root: Path, prepared: Path | None = None) -> Inventory:
         "turned": [[shot.name, shot.meta["orientation"]] for shot in shots if shot.meta],
     }
     facts = {name: value for name, value in facts.items() if value}  # none where photos are all that there is
-    notes = [] if root.is_file() else _left_out(root)
+    notes = [] if root.is_file() else [*_left_out(root), *notes_on_masks(root, shots)]
     return Inventory(shots, [points], "sfm", units_from="images alone have no unit", decided_by=files, facts=facts, notes=notes)
 
 

@@ -34,6 +34,8 @@ GOOD, BETTER, AS_GOOD = 0.3, 0.15, 0.05  # correlation that a factor must reach,
 def check(views: Sequence[FrameRecord], surface: np.ndarray, read: Callable[[str], FrameRecord]) -> None:
     """Raises UserError. views: of training; they need no pictures. surface: (P, 3) world. read: a frame by its id."""
     cameras = [view.camera for view in views]
+    if len(cameras) < 2:  # whatever is wrong, it is not that they stand together
+        return
     positions = np.array([camera.position for camera in cameras])
     surface = surface[:: max(len(surface) // POINTS, 1)].astype(np.float64)
     centre = np.median(surface, axis=0) if len(surface) else positions.mean(axis=0) + 1.0

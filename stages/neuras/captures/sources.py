@@ -162,6 +162,19 @@ def mask_of(root: Path, name: str) -> Path | None:
     return None
 
 
+def notes_on_masks(root: Path, shots: Iterable[Shot]) -> list[str]:
+    """A sentence about files in ``masks/`` that belong to no image, if there are any."""
+    taken = {shot.mask for shot in shots}
+    folder = root / MASKS
+    strays = sorted(path for path in folder.rglob("*") if path.is_file() and path not in taken and path.name[0] != ".")
+    if not strays:
+        return []
+    return [
+        f"{len(strays)} of the files in {MASKS}/ belong to no image, such as {strays[0].relative_to(folder).as_posix()}: "
+        "the mask of IMG_1.jpg is IMG_1.jpg.png or IMG_1.png"
+    ]
+
+
 def json_in(root: Path, path: Path, kind: type) -> Any:
     """The content of a JSON file that a set must have; raises UserError."""
     if not inside(path, root):

@@ -57,7 +57,9 @@ def side_by_side(runs: Sequence[Run]) -> Table:
         raise UserError("these evaluations are not of the same frames of one capture: their scores cannot be compared")
     if len({run.scored for run in runs}) > 1:
         ways = "; ".join(f"{run.name}: " + " ".join(f"evaluate.{name}={how}" for name, how in run.scored) for run in runs)
-        raise UserError(f"these evaluations do not score the same pixels, so they cannot be compared ({ways})")
+        raise UserError(
+            f"these evaluations do not score the same pixels, so they cannot be compared ({ways}): evaluate all with the same"
+        )
     columns = [(run.name, run, "ours") for run in runs] + [(METHODS["warping"], first, "warping")]
     rows: list[list[Any]] = []
     for group in main_groups(first.summary):

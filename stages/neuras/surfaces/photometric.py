@@ -82,7 +82,7 @@ def refine(
     )
     log(f"difference {before:.4f} before, {after:.4f} after")
     if after > (1 - settings.least_gain) * before:
-        log("the photos agree as well without it: nothing is moved")
+        log(f"less than {settings.least_gain:.0%} is gone (refine.least_gain), so nothing is moved")
         return mesh, cameras
     return state.mesh, state.cameras
 
