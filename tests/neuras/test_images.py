@@ -100,7 +100,9 @@ def test_masks_beside_the_photos_are_taken(tmp_path, registered, named):
     found = {frame.meta["file"]: frame.counts() for frame in frames(artifact)}
     assert len(found) == 6 and not found["00.png"][:8].any()
     assert np.array_equal(found["00.png"][40:], found["01.png"][40:]) and found["01.png"][:8].any()
-    assert list(jobs[0]["masks"]) == ["00.png.png"] and np.array_equal(jobs[0]["masks"]["00.png.png"], mask)
+    given = jobs[0]["masks"]  # pycolmap wants one for every photo
+    assert set(given) == {f"{name}.png" for name in jobs[0]["names"]} and np.array_equal(given.pop("00.png.png"), mask)
+    assert all(other.shape == mask.shape and (other == 255).all() for other in given.values())
     shutil.move(photos / "masks", photos.parent / "masks")  # a model of COLMAP has them beside its images
     by_colmap = next(frames(run(photos.parent, tmp_path / "store", name="colmap")))
     assert np.array_equal(by_colmap.counts(), found["00.png"])

@@ -13,7 +13,7 @@ import json
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -216,18 +216,23 @@ def _save_turned(photo: Image.Image, orientation: int, path: Path) -> None:
         picture.save(temporary, kind, exif=known, **options)
 
 
-def _masks(root: Path, folder: Path, names: Iterable[str]) -> str | None:
-    """The folder of the photos' masks, named as pycolmap wants them; None where there are none."""
+def _masks(root: Path, folder: Path, sizes: Mapping[str, tuple[int, int]]) -> str | None:
+    """The folder of the photos' masks as pycolmap wants them: one for every photo. None where there are none. sizes: of the
+    photos, (width, height).
+    """
     found: dict[str, Path] = {}
-    for name in names:
+    for name in sizes:
         with contextlib.suppress(Reject):  # told when the frame is asked for
             if (mask := mask_of(root, name)) is not None:
                 found[name] = mask
-    for name, mask in found.items():
+    for name, size in sizes.items() if found else ():
         path = folder / HIDDEN / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
-        path.symlink_to(mask.resolve())
+        if name in found:
+            path.symlink_to(found[name].resolve())
+        else:
+            Image.new("L", size, 255).save(path)
     return str((folder / HIDDEN).resolve()) if found else None
 
 
