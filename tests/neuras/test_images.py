@@ -81,7 +81,10 @@ def test_photos_that_lie_on_their_side_are_turned_first(tmp_path, registered):
     exif = lying.getexif()
     exif[images.ORIENTATION] = 6  # to be turned clockwise
     lying.save(photos / "02.png", exif=exif)
+    cut = (photos / "02.png").read_bytes()
+    (photos / "cut.png").write_bytes(cut[: len(cut) - 40])
     artifact = run(photos, tmp_path / "store")
+    assert artifact.manifest["outputs"]["rejects"] == {"unreadable": 1}
     frame = next(frame for frame in frames(artifact) if frame.meta["file"] == "02.png")
     assert np.abs(dot_of(frame) - frame.camera.project(POINT)[0]).max() < 0.12 and frame.meta["orientation"] == 6
     assert len(jobs[0]["names"]) == 6 and jobs[0]["one_camera"] and not jobs[0]["masks"]

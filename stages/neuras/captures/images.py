@@ -69,7 +69,8 @@ def read(config: Any, root: Path, prepared: Path | None = None) -> Inventory:
             if (orientation := _orientation(shot.image)) != 1:
                 shot.meta["orientation"] = orientation
                 if prepared is not None:
-                    size_of(shot.image, config.max_pixels)  # why there is no turned copy, if there is none
+                    if not (prepared / UPRIGHT / shot.name).is_file():
+                        opened(shot.image, config.max_pixels, "image")  # says why there is no turned copy
                     shot.image = file_in(prepared / UPRIGHT, shot.name, "image")
         if folder is not None:
             if shot.name not in placed:
