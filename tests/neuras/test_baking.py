@@ -232,7 +232,7 @@ def test_photos_on_the_page_say_nothing_of_where_they_were_taken_and_are_not_tur
     again = Image.open(io.BytesIO(bare))
     assert not again.getexif() and np.array_equal(np.array(again), np.array(Image.open(io.BytesIO(told))))
     assert site.without_metadata(bare) == bare
-    assert site.without_metadata(told[:2] + b"\xff" + told[2:]) in (bare, bare[:2] + b"\xff" + bare[2:])
+    assert site.without_metadata(told[:2] + b"\xff" + told[2:]) == bare  # a byte that may stand before any marker
     signed = told[:2] + b"\xff\xeb\x00\x0aat home!" + told[2:]  # APP11
     assert site.without_metadata(signed) == bare
     for other in (b"\x89PNG", told[:40], told + b"a video", told[:40] + b"\xff\xd9"):

@@ -190,9 +190,7 @@ def _upright(root: Path, folder: Path, names: list[str], max_pixels: int) -> Pat
     if not turned:
         return root
     for name in names:
-        path = folder / UPRIGHT / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
+        path = _vacated(folder / UPRIGHT / name)
         if name not in turned:
             path.symlink_to((root / name).resolve())
             continue
@@ -227,14 +225,19 @@ def _masks(root: Path, folder: Path, sizes: Mapping[str, tuple[int, int]]) -> st
             if (mask := mask_of(root, name)) is not None:
                 found[name] = mask
     for name, size in sizes.items() if found else ():
-        path = folder / HIDDEN / f"{name}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
+        path = _vacated(folder / HIDDEN / f"{name}.png")
         if name in found:
             path.symlink_to(found[name].resolve())
         else:
             Image.new("L", size, 255).save(path)
     return str((folder / HIDDEN).resolve()) if found else None
+
+
+def _vacated(path: Path) -> Path:
+    """The path, its folder made, and without what an earlier try left there: a link may point at a photo."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    return path
 
 
 def _cut(video: Path, folder: Path, names: list[str]) -> None:
